@@ -44,7 +44,6 @@ PROGRAMS = {
     "speed stages": Program("speed.stages", "stages", "time of the loop search by stage"),
     "speed live": Program("speed.live", "live", "latency, dropped scans and memory of bin/live"),
     "speed start-up": Program("speed.start_up", "start_up", "time until a command starts"),
-    "speed trees": Program("speed.trees", "trees", "commands of this checkout and of another one in turn"),
     "speed training": Program("speed.training", "training", "training steps, and their share of the device's peak"),
     "speed profile": Program("speed.profile_step", "profile", "parts of a training step"),
     "torch describe": Program("torch_peer.compare", "describe", "descriptors beside the same network in PyTorch"),
@@ -62,11 +61,9 @@ PROGRAMS = {
     "fleet places": Program("fleet.index", "places", "places for a large index"),
     "fleet index": Program("fleet.index", "index", "time, bytes and recall of a large index"),
     "robustness kills": Program("robustness.disturbed", "kills", "commands that are killed again and again"),
-    "robustness together": Program("robustness.disturbed", "together", "commands started twice at once on one folder"),
     "robustness disk": Program("robustness.disturbed", "disk", "full disk, read-only folder, missing files"),
     "robustness hostile": Program("robustness.hostile", "hostile", "bin/live with damaged messages, for minutes"),
     "fuzz": Program("robustness.fuzz", "fuzz", "damaged files of every format, for hours"),
-    "robustness mutations": Program("robustness.mutations", "mutations", "wrong lines, and whether tests notice them"),
     "robustness platforms": Program("robustness.platforms", "platforms", "wheels of every dependency, by platform"),
 }
 

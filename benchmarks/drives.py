@@ -14,7 +14,7 @@ from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import replacing
-from sglpr_jax.se3 import inverse, transform
+from sglpr_jax.se3 import inverse, poses_of, transform
 from sglpr_jax.sim.drive import CARRIERS
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording, simulate_repeating
 from sglpr_jax.sim.routes import REVISITS
@@ -165,9 +165,8 @@ def on_disk(recording: SimulatedRecording, folder: Path) -> Recording:
 def ready_made(data: Path, name: str) -> tuple[Recording, Float[np.ndarray, "n 4 4"]]:
     """Returns a recording of ready-made images, in the layout NN/imgs/*.png, and its poses from NN/pose.txt."""
     recording = open_recording(data, name)
-    poses = np.tile(np.eye(4), (len(recording), 1, 1))
-    poses[:, :3] = read_poses(data / name / "pose.txt")[[int(frame) for frame in recording.ids]]
-    return recording, poses
+    matrices = read_poses(data / name / "pose.txt")[[int(frame) for frame in recording.ids]]
+    return recording, poses_of(matrices[:, :, 3], matrices[:, :, :3])
 
 
 def recording_of(name: str, scans: Sequence[Scan], times: Float[np.ndarray, " n"] | None = None) -> Recording:

@@ -32,12 +32,12 @@ class Bounds(NamedTuple):
 
 Size = Annotated[int, Bounds(1, 2**20)]
 """Number of cells, channels or tokens. The upper bound rejects typing errors: such sizes fit into no memory."""
-SizeOrNone = Annotated[int, Bounds(0, 2**20)]
+SizeOrZero = Annotated[int, Bounds(0, 2**20)]
 Sizes = tuple[Size, ...]
 Depths = tuple[Annotated[int, Bounds(1, 64)], ...]
 """Number of blocks of each stage."""
 Count = Annotated[int, Bounds(1, 2**53)]
-CountOrNone = Annotated[int, Bounds(0, 2**53)]
+CountOrZero = Annotated[int, Bounds(0, 2**53)]
 Positive = Annotated[float, Bounds(above=0)]
 NotNegative = Annotated[float, Bounds(0)]
 Share = Annotated[float, Bounds(0, 1)]

@@ -121,10 +121,15 @@ def append_whole(file: int, content: bytes, *, size: int) -> None:
         raise
 
 
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file, completely or not at all. Raises WriteError if it cannot be written."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a text file in UTF-8, completely or not at all. Raises WriteError if it cannot be written."""
-    with replacing(path) as temporary:
-        temporary.write_bytes(text_bytes(text))
+    write_bytes(path, text_bytes(text))
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -19,7 +19,7 @@ class GrowingArray:
 
     @property
     def rows(self) -> Shaped[np.ndarray, "n ..."]:
-        """All rows. This is a view and must not be changed."""
+        """All rows, as a view that is valid until rows are added."""
         return self._storage[: self._count]
 
     @property

@@ -6,7 +6,8 @@ from jaxtyping import Bool, Float
 PlanarPose = Float[np.ndarray, "... 3"]
 """Poses in the x-y plane: x and y in metres, yaw in radians counter-clockwise."""
 ROTATION_TOLERANCE = 0.01
-"""Maximum deviation of an entry of R R^T from the identity, for rotations R in files with few digits."""
+"""Maximum deviation of an entry of R R^T from the identity, for rotations R in files with few digits, and of the length
+of a quaternion from 1."""
 
 
 def transform(x: float, y: float, yaw: float) -> Float[np.ndarray, "4 4"]:
@@ -91,16 +92,24 @@ def quaternions(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4"]:
     return Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)
 
 
+def poses_of(
+    positions: Float[np.ndarray, "n 3"], rotations: Float[np.ndarray, "n 3 3"] | None = None
+) -> Float[np.ndarray, "n 4 4"]:
+    """Combine positions and rotations to poses. By default the rotations are the identity."""
+    poses = np.tile(np.eye(4), (len(positions), 1, 1))
+    poses[:, :3, 3] = positions
+    if rotations is not None:
+        poses[:, :3, :3] = rotations
+    return poses
+
+
 def from_quaternions(
     translations: Float[np.ndarray, "n 3"], quaternions: Float[np.ndarray, "n 4"]
 ) -> Float[np.ndarray, "n 4 4"]:
     """Return the poses with these translations and with rotations from quaternions (x, y, z, w)."""
     from scipy.spatial.transform import Rotation  # imported here because the import is slow
 
-    poses = np.tile(np.eye(4), (len(translations), 1, 1))
-    poses[:, :3, 3] = translations
-    poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix().reshape(-1, 3, 3)
-    return poses
+    return poses_of(translations, Rotation.from_quat(quaternions).as_matrix().reshape(-1, 3, 3))
 
 
 def travelled(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " n"]:
@@ -120,6 +129,12 @@ def are_rotations(matrices: Float[np.ndarray, "*b 3 3"]) -> Bool[np.ndarray, "*b
     with np.errstate(over="ignore", invalid="ignore"):
         deviations = np.abs(matrices @ matrices.swapaxes(-1, -2) - np.eye(3)).max((-2, -1))
         return np.asarray((deviations < ROTATION_TOLERANCE) & (np.linalg.det(matrices) > 0))
+
+
+def have_unit_length(quaternions: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:
+    """Whether each quaternion has length 1, up to `ROTATION_TOLERANCE`, and so is a rotation."""
+    with np.errstate(invalid="ignore", over="ignore"):  # NaN and infinity have another length
+        return np.abs(np.linalg.norm(quaternions, axis=1) - 1) <= ROTATION_TOLERANCE
 
 
 def distances(a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "n m"]:

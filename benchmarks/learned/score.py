@@ -31,7 +31,6 @@ from sglpr_jax.methods.registry import handcrafted, method_with_weights, network
 from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.sglpr import init
 from sglpr_jax.models.weights_file import LAST_WEIGHTS
-from sglpr_jax.reproduce.reproduction import content_of
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import embed
 from sglpr_jax.revisits import database_end, has_near
@@ -80,7 +79,7 @@ def entry(name: str, runs: Path) -> Entry:
     folder = folder / LAST_WEIGHTS if (folder / LAST_WEIGHTS / "config.json").is_file() else folder
     trained = method_with_weights(str(folder))
     images, seconds = _training_effort(folder)
-    return Entry(name, content_of(str(folder)), lambda recording: trained, images=images, seconds=seconds)
+    return Entry(name, trained.takes, lambda recording: trained, images=images, seconds=seconds)
 
 
 def _training_effort(folder: Path) -> tuple[int, float]:

@@ -24,13 +24,13 @@ from sglpr_jax.cli.peers import RATES
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.files import write_json
 from sglpr_jax.methods.names import LEARNED_NAMES
+from sglpr_jax.models.weights_file import LAST_WEIGHTS
 from sglpr_jax.retrieval.distances import distance_function
 from sglpr_jax.stop_request import stop_on_signal
 from sglpr_jax.training.callbacks import Callback
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
 from sglpr_jax.training.metrics_log import read_metrics
 from sglpr_jax.training.peers import FIRST_SNAPSHOT, RATES_FILE
-from sglpr_jax.training.recipe import WEIGHTS
 from sglpr_jax.training.trainer import METRICS_FILE, SCORES_FILE
 from sglpr_jax.training.validation import recall_at_1
 
@@ -200,7 +200,7 @@ def _train(
         if clock.is_over:
             return
         options = {"resume": (run / "config.json").is_file(), "callback": clock}
-        options["weights"] = folder / UPRIGHT / WEIGHTS if before else None
+        options["weights"] = folder / UPRIGHT / LAST_WEIGHTS if before else None
         stage = [one for one in recordings if not upright or one.name != OPPOSITE]
         with stop_on_signal() as stopped:
             result = sglpr_jax.train(staged, stage, out=run, stopped=lambda: stopped() or clock.is_over, **options)  # noqa: B023

@@ -32,7 +32,6 @@ from sglpr_jax.loops.consistency import are_consistent
 from sglpr_jax.loops.probability import DEFAULT, TESTED, Evidence, LoopModel, fit
 from sglpr_jax.loops.sequence import neighbour_weights
 from sglpr_jax.models.weights import Params
-from sglpr_jax.se3 import transform
 
 PAIRS = 300.0
 """Total weight of the pairs of all drives of a kind: a world with one kind of revisits and of odometry."""
@@ -117,7 +116,7 @@ def _pairs(drive: DescribedDrive, odometry: Odometry, params: Params, *, breaks:
     search, poses = CandidateSearch(params), drive.odometry(odometry, int(drive.facts["seed"]))
     candidates = [pair for of_scan in replay(search, drive, poses, breaks=breaks) for pair in of_scan]
     candidates = [pair for pair in candidates if pair.evidence.deviation <= search.present_drift.max_deviation]
-    estimated_poses = [transform(*(float(value) for value in pair.alignment[:3])) for pair in candidates]
+    estimated_poses = [pair.alignment.match_from_query for pair in candidates]
     scans = [(int(search.rows[pair.query]), int(search.rows[pair.match])) for pair in candidates]
     errors = pose_errors(scans, np.array(estimated_poses), drive.world_from_lidar)
     evidence = np.array([pair.evidence for pair in candidates], np.float64).reshape(-1, len(Evidence._fields))

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.described import REPEATING_M, WAY_M
 from benchmarks.drives import Drive, is_revisit
-from sglpr_jax.se3 import distances, inverse, travelled, yaw_of
+from sglpr_jax.se3 import distances, inverse, travelled, wrap_angle, yaw_of
 from sglpr_jax.sim.styles import SCENERIES
 
 Poses = Float[np.ndarray, "n 4 4"]
@@ -157,6 +157,6 @@ def pose_errors(
     query, match = world_from_lidar[frames[:, 0]], world_from_lidar[frames[:, 1]]
     true, estimated = inverse(match) @ query, np.reshape(match_from_query, (-1, 4, 4))
     metres = np.linalg.norm((estimated - true)[:, :2, 3], axis=1)
-    degrees = np.degrees(np.abs((yaw_of(estimated) - yaw_of(true) + np.pi) % (2 * np.pi) - np.pi))
+    degrees = np.degrees(np.abs(wrap_angle(yaw_of(estimated) - yaw_of(true))))
     storey_m = np.abs(query[:, 2, 3] - match[:, 2, 3]) - SLOPE * np.linalg.norm((query - match)[:, :2, 3], axis=1)
     return PoseErrors(metres, degrees, storey_m)

@@ -17,7 +17,7 @@ import sglpr_jax
 from benchmarks import described
 from benchmarks.drives import drifted, lidar
 from benchmarks.quality.scoring import OTHER_M
-from sglpr_jax.se3 import inverse, yaw_of
+from sglpr_jax.se3 import inverse, wrap_angle, yaw_of
 from sglpr_jax.sim.drive import PlanarPath, drive_seed, plan_path
 from sglpr_jax.sim.recording import PAUSE_S, drive_through
 from sglpr_jax.sim.routes import travelled
@@ -126,7 +126,7 @@ def _plan(seed: int, *, scans: int, spacing_m: float) -> tuple[PlanarPath, Windo
         common_m = float(is_near.sum() * spacing_m)
         if COMMON_M[0] <= common_m <= COMMON_M[1]:
             nearest = distance.argmin(axis=1)
-            turn = (path.yaw[second] - path.yaw[first][nearest] + np.pi) % (2 * np.pi) - np.pi
+            turn = wrap_angle(path.yaw[second] - path.yaw[first][nearest])
             return path, Windows((first, second), common_m, float(np.median(np.degrees(np.abs(turn))[is_near])))
     raise ValueError(f"seed {seed}: expected drives with {COMMON_M} m in common, found none in {TRIES} draws")
 

@@ -1,4 +1,4 @@
-"""Tests of commands that write files: killed, started twice at once, with troubles of disk and input.
+"""Tests of commands that write files: killed, and with troubles of disk and input.
 
 Inputs are small, so that a command takes a second. A command runs in a process that is forked from this one, which has
 imported the command's module but not started JAX. The command therefore starts quickly, and a kill hits its work.
@@ -46,11 +46,10 @@ def start(
     arguments: Sequence[str],
     folder: Path,
     *,
-    errors: str = ERRORS,
     file_bytes: int | None = None,
     unprivileged: bool = False,
 ) -> Process:
-    """Starts a command in a folder. Its stderr goes to the file `errors` there.
+    """Starts a command in a folder. Its stderr goes to the file `ERRORS` there.
 
     Files are limited to `file_bytes`. An `unprivileged` process respects file permissions even if its user is root.
     """
@@ -67,7 +66,7 @@ def start(
     def work() -> None:
         os.chdir(folder)
         sys.argv = ["sglpr_jax.cli", command, *arguments]
-        for stream, path in ((1, os.devnull), (2, errors)):
+        for stream, path in ((1, os.devnull), (2, ERRORS)):
             os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), stream)
         if file_bytes is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, file_bytes))
@@ -114,9 +113,9 @@ class Trial:
         """Run the command to its end, and return the exit status."""
         return status_of(self.start(**options))
 
-    def error(self, errors: str = ERRORS) -> str:
+    def error(self) -> str:
         """Text that the command printed to stderr."""
-        path = self.folder / errors
+        path = self.folder / ERRORS
         return path.read_text() if path.exists() else ""
 
     def files(self) -> dict[str, bytes]:
@@ -259,31 +258,6 @@ def _killed(name: str, root: Path, undisturbed: Undisturbed, *, times: int, seed
             counts["next run fails"] += 1
             print(f"{name}: the next run ended with {status}: {trial.error()[-2000:]}", file=sys.stderr)
     yield {"seconds": f"{undisturbed.seconds:.1f}", "files": len(undisturbed.files), **counts}
-
-
-def together(*, commands: tuple[str, ...] = tuple(WRITERS), times: int = 5) -> None:
-    """Start each command twice at once on one folder: both end well, or one is refused in one line.
-
-    Args:
-        commands: names in `WRITERS`.
-        times: how often each is started twice.
-    """
-    _disturb(commands, functools.partial(_doubled, times=times))
-
-
-def _doubled(name: str, root: Path, undisturbed: Undisturbed, *, times: int) -> Iterator[dict[str, Any]]:
-    """Start a command twice at once, this many times."""
-    counts: dict[str, Any] = dict.fromkeys(("both end well", "one is refused", "fail", "other bytes"), 0)
-    for _ in range(times):
-        trial, errors = Trial(name, root), (f"{ERRORS}-0", f"{ERRORS}-1")
-        statuses = [status_of(process) for process in [trial.start(errors=one) for one in errors]]
-        failures = [trial.error(one) for one, status in zip(errors, statuses, strict=True) if status]
-        refused = len(failures) == 1 and _is_one_line(failures[0])
-        counts["both end well" if not failures else "one is refused" if refused else "fail"] += 1
-        for error in failures:
-            print(f"{name}: one of two ended with: {error[-2000:]}", file=sys.stderr)
-        counts["other bytes"] += trial.count_differing(undisturbed.files, "differs after two at once", complete=True)
-    yield counts
 
 
 def _is_one_line(error: str, *, named: str = "") -> bool:

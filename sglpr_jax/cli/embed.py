@@ -14,7 +14,7 @@ from sglpr_jax.cli.recording import (
     resolved_scale,
 )
 from sglpr_jax.data.choices import ScaleChoice
-from sglpr_jax.fields import CountOrNone, Size
+from sglpr_jax.fields import CountOrZero, Size
 from sglpr_jax.methods.names import NETWORK, AnyMethodName
 from sglpr_jax.progress import progress_bar
 
@@ -61,7 +61,7 @@ class EmbedCommand:
     corruption: str | None = None
     """Corrupt every scan for a stress test: occlusion-DEGREES, beams-NUMBER, noise-METRES, dropout-SHARE,
     offset-METRES, or rotation (as --rotate)."""
-    seed: CountOrNone = 0
+    seed: CountOrZero = 0
     """Seed of --rotate and --corruption. The seed and the scan's number determine the corruption of a scan."""
     skip_bad: bool = False
     """Report unreadable scans and skip them."""

@@ -42,7 +42,7 @@ class ExportCommand:
     images."""
     whiten: tuple[Path, ...] = ()
     """Datasets or folders of scans. A last layer is fitted to the descriptors of these scans. It evens out the spread
-    of descriptors over all directions (models/whitening.py). It replaces an existing whitening layer."""
+    of descriptors over all directions. It replaces an existing whitening layer."""
     whiten_power: NotNegative = WHITENING_POWER
     """Exponent of the whitening: each principal component is divided by this power of its spread. 1 evens out all
     components."""

@@ -94,9 +94,9 @@ def run_node(
     Raises ValueError if a setting is invalid or the folder has a map of other settings, and WriteError if the folder
     cannot be written.
     """
+    from sglpr_jax.live.cloud_scans import CloudScans
     from sglpr_jax.live.node import Node
     from sglpr_jax.live.result_files import write_results
-    from sglpr_jax.live.stored_scans import StoredScans
 
     with exclusive_lock(command.out), contextlib.ExitStack() as exit_stack:
         live_map = _open_map(command, report)
@@ -104,7 +104,7 @@ def run_node(
         unpublished, stored = live_map.restore(), None
         if command.output.any:
             config = command.output.cloud_settings
-            stored = StoredScans(command.out / "scans", live_map, config=config, report=report)
+            stored = CloudScans(command.out / "scans", live_map, config=config, report=report)
         sinks = []
         for sink in open_sinks():
             exit_stack.callback(_close_sink, sink, report)

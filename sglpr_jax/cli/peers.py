@@ -10,7 +10,7 @@ from rich.table import Table
 
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.runtime import cache_folder, console, print_error
-from sglpr_jax.fields import CountOrNone, NotNegative, Positive
+from sglpr_jax.fields import CountOrZero, NotNegative, Positive
 from sglpr_jax.methods.names import LearnedName
 from sglpr_jax.progress import progress_bar
 from sglpr_jax.stop_request import StopRequest, stop_on_signal
@@ -48,9 +48,9 @@ class PeersCommand:
     """Folder of the run."""
     seconds: NotNegative = 3600.0
     """Training time in seconds. Scores and the compilation of the step do not count."""
-    images: CountOrNone = 0
+    images: CountOrZero = 0
     """Number of images after which the training stops, if the time is not over before; 0: no limit."""
-    seed: CountOrNone = 0
+    seed: CountOrZero = 0
     """Seed of the weights, the tuples and the rotations."""
     learning_rate: Positive | None = None
     """Learning rate. None: the best of three short trainings with --held-out, otherwise the published rate."""

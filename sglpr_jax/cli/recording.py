@@ -173,11 +173,8 @@ class CloudOptions:
 
     def check_recordings(self, recordings: "Sequence[Recording]") -> None:
         """Raise ValueError if a file is asked for and a recording has ready-made images."""
-        if self.any:
-            from sglpr_jax.maps.point_cloud import require_points  # slow import, not needed for --help
-
-            for recording in recordings:
-                require_points(recording)
+        for recording in recordings if self.any else ():
+            recording.require_scans("scans for --cloud and --grid")
 
     def write(
         self,
@@ -327,7 +324,8 @@ def open_with_odometry(
         poses = [_odometry_of(recording, command, checkpoint(number)) for number, recording in enumerate(recordings)]
         deskew = command.submap.deskew or all(map(has_point_times, recordings))
         submap = dataclasses.replace(command.submap, deskew=deskew)
-        command = dataclasses.replace(command, submap=submap, scan_odometry=command.scan_odometry.effective)
+        settings = dataclasses.replace(command.scan_odometry, voxel_m=command.scan_odometry.used_voxel_m)
+        command = dataclasses.replace(command, submap=submap, scan_odometry=settings)
     elif odometry:
         files = zip(paths, odometry, strict=True)
         pairs = [open_with_poses(command.source, path, file, format=format) for path, file in files]

@@ -12,7 +12,7 @@ from rich.table import Table
 from sglpr_jax.cli.recording import OdometrySubmapOptions, RecordingOptions
 from sglpr_jax.cli.runtime import console
 from sglpr_jax.data.choices import Scale, ScanFormat, SensorHeight
-from sglpr_jax.fields import CountOrNone
+from sglpr_jax.fields import CountOrZero
 from sglpr_jax.loops.config import CANDIDATES, MIN_PROBABILITY, PlaceCount
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.same_place import NEGATIVE_M
@@ -40,7 +40,7 @@ class RelocalizeCommand:
     bag or a folder of scans."""
     map: Path
     """Map of bin/map."""
-    frame: CountOrNone | None = None
+    frame: CountOrZero | None = None
     """Number of the scan in the recording, from 0."""
     seq: str | None = None
     """Sequence of the recording. May be omitted if there is only one."""

@@ -66,7 +66,7 @@ class TrainCommand:
     cache: Path | None = None
     """Folder in which each training recording is packed on first use, for faster reading (docs/guides/training.md)."""
     method: tuple[BesideName, ...] = BESIDE
-    """Methods that are scored beside the trained network at the end. `untrained` is this network before training;
+    """Methods that are scored beside the trained network at the end. `untrained` is this network with random weights;
     `shipped` are the default weights."""
     tensorboard: bool = False
     """Also write event files for TensorBoard (extra `tensorboard`)."""
@@ -90,8 +90,8 @@ class TrainCommand:
     )
 
 
-def train_and_test(command: TrainCommand, *, stop_advice: str = "continue with --resume") -> None:
-    """Run the command. If a signal stops the training, print `stop_advice` and exit."""
+def train_and_test(command: TrainCommand) -> None:
+    """Run the command. If a signal stops the training, exit."""
     from sglpr_jax.evaluation.final_test import final_test  # slow imports, not needed for --help
     from sglpr_jax.training.devices import connected, is_first_host
     from sglpr_jax.training.run_folder import CONFIG_FILE
@@ -99,7 +99,7 @@ def train_and_test(command: TrainCommand, *, stop_advice: str = "continue with -
     folder = run_folder(command)
     with connected(hosts=command.hosts, host_index=command.host_index, coordinator=command.coordinator):
         recordings, also, test = _open_recordings(command)
-        result = _train(command, recordings, also, test, stop_advice=stop_advice)
+        result = _train(command, recordings, also, test)
     if is_first_host():
         out, seed = folder / "test", command.config.seed
         console().print(final_test(result.params, test, out, methods=command.method, seed=seed, progress=progress_bar))
@@ -121,12 +121,7 @@ def settings(command: TrainCommand) -> dict[str, object]:
 
 
 def _train(
-    command: TrainCommand,
-    recordings: "Sequence[Recording]",
-    also: "Sequence[Recording]",
-    test: "Recording",
-    *,
-    stop_advice: str,
+    command: TrainCommand, recordings: "Sequence[Recording]", also: "Sequence[Recording]", test: "Recording"
 ) -> "TrainResult":
     """Train with the flags of the command. If a signal stops the training, save its state and exit."""
     from sglpr_jax.evaluation.learning_curves import LearningCurves
@@ -152,7 +147,7 @@ def _train(
         )
     if is_first_host():
         print(result, file=sys.stderr)
-    exit_unless_finished(result, stopped, stop_advice=stop_advice)
+    exit_unless_finished(result, stopped, stop_advice="continue with --resume")
     return result
 
 

@@ -176,10 +176,8 @@ def corruption_named(name: str) -> Corruption:
         known = [corruption.name for corruption in CORRUPTIONS]
         nearest = difflib.get_close_matches(name, known, n=1, cutoff=0)[0]
         raise ValueError(f"expected a corruption such as {', '.join(known)}, found {name!r}; did you mean {nearest!r}?")
-    try:
+    with naming(name):
         return Corruption(kind, float(strength or 0))
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error
 
 
 def corrupt(

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32
 
-from sglpr_jax.data.poses import checked_scan_poses
+from sglpr_jax.data.poses import as_scan_poses
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 
@@ -97,7 +97,8 @@ def deskewed(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"])
     Example:
       recording = sglpr_jax.deskewed(recording, sglpr_jax.read_odometry("odometry.tum"))
     """
-    poses, times = checked_scan_poses(recording, world_from_lidar, use=DESKEWED), recording.times
+    recording.require_scans("scans to deskew")
+    poses, times = as_scan_poses(world_from_lidar, recording, of="poses"), recording.times
     if times is None:
         raise ValueError(f"sequence {recording.name}: expected times of the scans to remove their motion, found none")
     first = _first_readable(recording)

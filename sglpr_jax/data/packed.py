@@ -80,8 +80,8 @@ def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], N
     """
     if not recording.on_disk:
         raise ValueError(
-            f"sequence {recording.name}: expected a recording that is read from its files, found a packed, "
-            "corrupted or simulated one"
+            f"sequence {recording.name}: expected a recording whose scans are files, found another one: a bag, a point "
+            "cloud map, or a packed, changed or simulated recording"
         )
     source = _source(recording)
     identity = hashlib.sha256(json.dumps(source).encode()).hexdigest()[:16]

@@ -1,13 +1,15 @@
 """Poses of scans: checks, and interpolation of poses at the times of the scans."""
 
-from typing import NamedTuple
+import os
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import usual_step
-from sglpr_jax.se3 import are_rotations
+from sglpr_jax.files import in_short, naming
+from sglpr_jax.se3 import ROTATION_TOLERANCE, are_rotations, poses_of
 
 GAP_RANGE_S = (1.0, 2.0)
 """Range of the maximum time between two poses for interpolation (`widest_gap_s`), in seconds."""
@@ -21,42 +23,52 @@ LEAST_SHARE = 0.5
 """Minimum fraction of scans with a pose. Below it, the poses are of another drive or clock, or no trajectory."""
 
 
-def poses_of(
-    positions: Float[np.ndarray, "n 3"], rotations: Float[np.ndarray, "n 3 3"] | None = None
-) -> Float[np.ndarray, "n 4 4"]:
-    """Combine positions and rotations to poses. By default the rotations are the identity."""
-    poses = np.tile(np.eye(4), (len(positions), 1, 1))
-    poses[:, :3, 3] = positions
-    if rotations is not None:
-        poses[:, :3, :3] = rotations
+def as_pose(odometry: Any) -> Float[np.ndarray, "4 4"] | None:
+    """Convert a pose to a 4 x 4 array. Returns None for None."""
+    return None if odometry is None else _checked_poses(odometry, "odometry (4, 4)", 2)
+
+
+def as_poses(poses: Any, *, of: str) -> Float[np.ndarray, "n 4 4"]:
+    """Convert an array or a list of 4 x 4 arrays to poses. Errors name them by `of`, for instance "odometry"."""
+    return _checked_poses(poses, f"{of} (n, 4, 4)", 3)
+
+
+def as_scan_poses(poses: Any, recording: Recording, *, of: str) -> Float[np.ndarray, "n 4 4"]:
+    """Convert to poses, one for each scan of a recording. Raises ValueError for another number of poses."""
+    with naming(recording.name):
+        converted = as_poses(poses, of=of)
+        if len(converted) != len(recording):
+            raise ValueError(f"expected {of} of {len(recording)} scans, found {of} of {len(converted)} scans")
+    return converted
+
+
+def _checked_poses(values: Any, expected: str, ndim: int) -> Float[np.ndarray, "*n 4 4"]:
+    """Convert to an array of poses of `ndim` axes: finite matrices with a rotation and the last row 0 0 0 1."""
+    poses = as_array(values, np.float64, expected, by="read_odometry")
+    if poses.ndim != ndim or poses.shape[-2:] != (4, 4):
+        raise ValueError(f"expected {expected}, found an array of shape {poses.shape}")
+    matrices = poses.reshape(-1, 4, 4)
+    valid = np.isfinite(matrices).all((-2, -1)) & are_rotations(matrices[:, :3, :3])
+    valid &= np.abs(matrices[:, 3] - [0, 0, 0, 1]).max(-1) < ROTATION_TOLERANCE
+    if not valid.all():
+        row = int(valid.argmin())
+        raise ValueError(f"expected {expected}, with rotations, found {matrices[row].tolist()} in row {row}")
     return poses
 
 
-def checked_scan_poses(
-    recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"], *, use: str
-) -> Float[np.ndarray, "n 4 4"]:
-    """Return poses given by the user, one for each scan of a recording, as float64. `use` is their use, for messages.
-
-    Raises ValueError for ready-made images, another number of poses, or invalid poses (`checked_poses`).
-    """
-    if recording.has_images:
-        raise ValueError(f"sequence {recording.name}: expected scans for {use}, found ready-made images")
-    poses = np.asarray(world_from_lidar, np.float64)
-    if poses.shape != (len(recording), 4, 4):
-        raise ValueError(
-            f"sequence {recording.name}: expected a pose (4, 4) for each of {len(recording)} scans, found an array of "
-            f"shape {poses.shape}"
-        )
-    return checked_poses(poses, use=use)
+def as_array(values: Any, dtype: type, expected: str, *, by: str) -> np.ndarray:
+    """Convert to an array of numbers, or raise TypeError. For a path, the message names its reader, `by`."""
+    if isinstance(values, str | os.PathLike):
+        raise TypeError(f"expected {expected}, found the path {values}; read it with sglpr_jax.{by}")
+    try:
+        return np.asarray(values, dtype)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"expected {expected}, found {value_or_type(values)} ({in_short(error)})") from error
 
 
-def checked_poses(poses: Float[np.ndarray, "n 4 4"], *, use: str) -> Float[np.ndarray, "n 4 4"]:
-    """Return the poses. Raises ValueError if a pose is not finite or its 3 x 3 part is no rotation."""
-    is_invalid = ~(np.isfinite(poses).all((-2, -1)) & are_rotations(poses[:, :3, :3]))
-    if is_invalid.any():
-        row = int(is_invalid.argmax())
-        raise ValueError(f"{use}: expected poses with rotations, found {poses[row].tolist()} at scan {row}")
-    return poses
+def value_or_type(value: Any) -> str:
+    """The value itself if it is a string or path, otherwise its type."""
+    return f"{value!r}" if isinstance(value, str | os.PathLike) else f"a {type(value).__name__}"
 
 
 def widest_gap_s(stamps: Float[np.ndarray, " n"]) -> float:

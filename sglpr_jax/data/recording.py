@@ -52,13 +52,15 @@ class Recording:
     resolution_m: float | None = None
     """Edge of a pixel of ready-made images, in metres. None for scans."""
     on_disk: bool = True
-    """Whether `read` returns the content of the files. False for packed, corrupted and simulated recordings."""
+    """Whether each scan is a file that `read` reads unchanged. False for bags, point cloud maps, and packed, changed or
+    simulated recordings."""
     mounting: Mounting | None = None
     """Height and tilt of the sensor. None means gravity-aligned, 1.73 m above the ground."""
     mountings: tuple[Mounting, ...] | None = None
     """Mounting at each scan of a sensor that tilts. None means that `mounting` holds for all scans."""
     world_from_lidar: Float[np.ndarray, "n 4 4"] | None = None
-    """Poses of the LiDAR in the frame of a bag's messages, if these contain rotations. None for other layouts."""
+    """Poses of the LiDAR: those of a bag in the frame of its messages, if these contain rotations, or those of a point
+    cloud map. None for other layouts."""
     read_ups: ReadUps | None = None
     """Function that reads up at each scan from an IMU. None without an IMU, and when the gravity is known."""
     found: tuple[str, ...] = ()
@@ -170,12 +172,15 @@ class Recording:
         mountings = [self.mounting] if self.mountings is None else self.mountings
         return np.broadcast_to([upright_from_lidar(mounting) for mounting in mountings], (len(self), 4, 4))
 
+    def require_scans(self, expected: str = "scans") -> None:
+        """Raise ValueError if the recording has ready-made images. `expected` says why it needs scans."""
+        if self.has_images:
+            raise ValueError(f"sequence {self.name}: expected {expected}, found ready-made images")
+
     def points(self, i: int) -> Float32[np.ndarray, "n 3"]:
         """Read the points of scan `i`. Raises ValueError if the recording contains images."""
-        points = self.scan(i, labels=False).points
-        if points is None:
-            raise ValueError(f"sequence {self.name}: expected scans, found ready-made images")
-        return points
+        self.require_scans()
+        return self.scan(i, labels=False).cloud
 
     def image(self, i: int) -> Float32[np.ndarray, "h w"]:
         """Read image `i`. Raises ValueError if the recording contains scans."""

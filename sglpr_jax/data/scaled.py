@@ -33,8 +33,7 @@ def scaled(recording: Recording, scale: Scale) -> Recording:
     check_value(scale, Scale, "scale")
     if scale == 1:
         return recording
-    if recording.has_images:
-        raise ValueError(f"sequence {recording.name}: expected scans to scale by {scale}, found ready-made images")
+    recording.require_scans(f"scans to scale by {scale}")
     mountings = recording.mountings
     return recording.with_reader(
         lambda row, label_path, lasers: scaled_scan(recording.read_row(row, label_path, lasers), scale),

@@ -21,6 +21,8 @@ OnBadScan = Callable[[str, Exception], None]
 T = TypeVar("T")
 Compute = Callable[[int, Scan], T]
 """Computes a result from the row of a scan and the scan."""
+SCANS_AHEAD = 8
+"""Usual number of scans that are read ahead."""
 
 
 def scan_stream(

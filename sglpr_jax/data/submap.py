@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt64
 
-from sglpr_jax.data.poses import checked_poses, checked_scan_poses
+from sglpr_jax.data.poses import as_poses, as_scan_poses
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan, check_cloud
 from sglpr_jax.files import warn
@@ -70,7 +70,7 @@ class SubmapBuilder:
         Raises ValueError if `check_cloud` rejects the points, or if the pose has no rotation.
         """
         check_cloud(points)
-        pose = checked_poses(np.asarray(world_from_lidar, np.float64)[None], use=SUBMAPS)[0]
+        (pose,) = as_poses([world_from_lidar], of="world_from_lidar")
         newest, *older = self._window.add(pose)
         older_scans = {frame: self._scans[frame] for frame in older}
         self._scans = {newest: (_one_point_per_voxel(Scan(points=points)), pose), **older_scans}
@@ -103,7 +103,8 @@ def submaps(
     if length_m == 0:
         return recording
     window = _KeyframeWindow(length_m, keyframe_m)
-    poses = checked_scan_poses(recording, world_from_lidar, use=SUBMAPS)
+    recording.require_scans("scans for submaps")
+    poses = as_scan_poses(world_from_lidar, recording, of="poses")
     rows_of_submap = [window.add(pose) for pose in poses]
 
     @lru_cache(maxsize=max(map(len, rows_of_submap), default=1))  # the scans of one submap

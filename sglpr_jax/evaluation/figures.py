@@ -263,17 +263,13 @@ def loops_in_time(
 
 
 def overlaid(
-    query: Num[np.ndarray, "n n"],
-    match: Num[np.ndarray, "n n"],
-    match_from_query: Float[np.ndarray, "4 4"],
-    *,
-    resolution_m: float = DENSITY_RESOLUTION_M,
+    query: Num[np.ndarray, "n n"], match: Num[np.ndarray, "n n"], match_from_query: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "n n 3"]:
     """Overlay the density images of a query and its match, as RGB colours from 0 to 1.
 
     The match is green. The query, transformed to the frame of the match, is magenta. Cells occupied in both are white.
     """
-    centre, pixels_per_m = (len(match) - 1) / 2, 1 / resolution_m
+    centre, pixels_per_m = (len(match) - 1) / 2, 1 / DENSITY_RESOLUTION_M
     # From (x, y, 1) in metres to (row, column, 1) in pixels. Rows run towards -y, columns towards x.
     pixel_from_metres = np.array([[0, -pixels_per_m, centre], [pixels_per_m, 0, centre], [0, 0, 1]])
     in_plane = inverse(match_from_query)[np.ix_([0, 1, 3], [0, 1, 3])]  # without z

@@ -19,13 +19,14 @@ import numpy as np
 from jaxtyping import Num
 
 from sglpr_jax.data.formats.pose_files import Trajectory
-from sglpr_jax.data.poses import poses_at_scans, poses_of
+from sglpr_jax.data.poses import poses_at_scans
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation.protocols.protocol import Input, ScoredPairs, TopK
 from sglpr_jax.files import in_short, naming
 from sglpr_jax.numpy_files import read_array
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function
+from sglpr_jax.se3 import poses_of
 
 SAME_M = 0.01
 """Positions in two files are the same up to this difference in metres, because programs round what they write."""

@@ -11,7 +11,7 @@ from sglpr_jax.training.trainer import METRICS_FILE
 PICTURE = "learning-curves.png"
 PANELS = {
     "loss": ("loss", *TERM_NAMES),
-    "score: recall@1 of held-out or training places": ("score",),
+    "score of held-out or training places": ("score",),
     "gradient norm": ("gradient_norm",),
 }
 """Title of each panel, and the names of its curves in the metrics file."""

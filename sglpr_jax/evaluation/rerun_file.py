@@ -14,7 +14,7 @@ from sglpr_jax.files import replacing
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.result import LoopSearchResult, Session
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
-from sglpr_jax.se3 import transformed, travelled
+from sglpr_jax.se3 import poses_of, transformed, travelled
 from sglpr_jax.voxels import one_per_voxel
 
 KEYFRAME_M = 5.0
@@ -65,9 +65,7 @@ def _map_poses(result: LoopSearchResult, optimized: OptimizedTrajectory | None) 
     positions = session.recording.positions
     if positions is None:
         return None
-    poses = np.tile(np.eye(4), (session.frames, 1, 1))
-    poses[:, :3, 3] = positions[: session.frames] - positions[0]
-    return poses
+    return poses_of(positions[: session.frames] - positions[0])
 
 
 def _viewer_layout(*, with_map: bool) -> Any:

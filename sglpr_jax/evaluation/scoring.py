@@ -180,8 +180,9 @@ def evaluate(
     if isinstance(source, str | Path):
         path = Path(source)
         file_input = read_input(path, trajectory, sequence=path.stem, distance=distance)
-        with naming(path):
-            file_input = _with_fields(file_input, times=times)
+        if trajectory is None:  # otherwise `read_input` has set the times, too
+            with naming(path):
+                file_input = _with_fields(file_input, times=times)
         return evaluate_methods({path.stem: file_input}, protocols, published=published, file=path)
     if distance is not None:
         distance_function(distance)  # raises ValueError if the name is unknown

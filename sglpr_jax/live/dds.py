@@ -55,7 +55,7 @@ class _Reader(NamedTuple):
 
 
 class DdsTransport:
-    """Participant of a DDS domain. A thread takes the messages. See `ros.Transport`."""
+    """Participant of a DDS domain. A thread takes the messages. See `ros_topics.Transport`."""
 
     def __init__(self, domain: int, report: Report):
         """Join a domain. CYCLONEDDS_URI in the environment configures cyclonedds, as for ROS 2. Raises ValueError if
@@ -183,7 +183,7 @@ def _configure(domain: int) -> Domain | None:
 
 
 def _qos(depth: int, *, reliable: bool, latched: bool) -> Qos:
-    """Return the QoS of a reader or writer. See `ros.Transport.subscribe` for the arguments."""
+    """Return the QoS of a reader or writer. See `ros_topics.Transport.subscribe` for the arguments."""
     return Qos(
         Policy.Reliability.Reliable(duration(milliseconds=100)) if reliable else Policy.Reliability.BestEffort,
         Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,

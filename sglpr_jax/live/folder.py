@@ -13,13 +13,14 @@ from sglpr_jax.data.choices import PoseFormat, RecordFormat, TimeUnit
 from sglpr_jax.data.formats.bin_records import detect_format_unless_kitti
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, parse_numbers, quaternion_poses
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, format_by_name, scan_of_file
-from sglpr_jax.data.poses import BEYOND_S, pose_at, poses_of
+from sglpr_jax.data.poses import BEYOND_S, pose_at
 from sglpr_jax.data.readers.listing import files_in
 from sglpr_jax.data.times import EPOCH, PER_SECOND
 from sglpr_jax.files import in_short
 from sglpr_jax.live.data_types import LiveFrame, Report
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.sources_and_sinks import IsInMap
+from sglpr_jax.se3 import poses_of
 
 POLL_S = 0.05
 """Time between two looks at the folder, in seconds."""

@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import SensorHeight
+from sglpr_jax.data.poses import as_pose
 from sglpr_jax.files import append_whole, raising_write_error
 from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.live.data_types import LiveFrame, LoopEdge, Report
 from sglpr_jax.live.odometry_input import FixedMounting, OdometryContinuity, OdometryState, ScanClock
-from sglpr_jax.loops.arguments import as_pose
 from sglpr_jax.loops.candidates import agree
 from sglpr_jax.loops.checkpoint import FRAME_FORMAT, frame_bytes, read_frame
 from sglpr_jax.loops.closure import LoopClosure

@@ -9,10 +9,10 @@ from typing import Literal
 import numpy as np
 
 from sglpr_jax.files import in_short
+from sglpr_jax.live.cloud_scans import CloudScans
 from sglpr_jax.live.data_types import FrameStatus, LiveFrame, LoopEdge, Report
 from sglpr_jax.live.live_map import LiveMap
 from sglpr_jax.live.sources_and_sinks import Sink, Source
-from sglpr_jax.live.stored_scans import StoredScans
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.models.weights import Params
@@ -36,7 +36,7 @@ class Node:
         *,
         report: Report,
         say: Callable[[str], object],
-        stored: StoredScans | None = None,
+        stored: CloudScans | None = None,
     ):
         """Connect a map to sinks and, if points are kept, to their folder. `say` prints lines about the progress."""
         self._live, self._sinks, self._report, self._say = live, list(sinks), report, say

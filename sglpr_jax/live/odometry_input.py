@@ -90,7 +90,7 @@ class OdometryContinuity:
         return OdometryState(pose, continues)
 
     def _awaits_odometry(self, pose: Float[np.ndarray, "4 4"] | None, time: float) -> bool:
-        """Return whether the first scans still wait for odometry. If not, `_has_odometry` is set by this scan."""
+        """Return whether the first scans still wait for odometry. If not, `has_odometry` is set by this scan."""
         self._began = time if self._began is None else self._began
         if pose is None and self._expected and time - self._began < WAIT_S:
             self._report("wait", "expected odometry, found none yet; scans are left out until it comes")

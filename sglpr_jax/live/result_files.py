@@ -29,7 +29,8 @@ def write_results(live: LiveMap, folder: Path) -> list[Path]:
         segments = np.split(scans, segment_starts)
         chains = [(frames, odometry[frames]) for frames in segments]
     loops = live.loops
-    files = graph_files(loops, detector.rejected, chains, drift=detector.config.drift)
+    rejected = [*detector.rejected, *detector.undecided()]
+    files = graph_files(loops, rejected, chains, drift=detector.config.drift)
     files[LOOPS_FILE] = partial(write_loops_jsonl, loops=loops)
     if len(odometry):
         files[TRAJECTORY] = partial(write_tum, poses=odometry, times=live.stamps)

@@ -44,7 +44,7 @@ ANSWER_S = 1.0
 
 
 class ZenohTransport:
-    """Connection by a zenoh session. See `ros.Transport` for the methods."""
+    """Connection by a zenoh session. See `ros_topics.Transport` for the methods."""
 
     def __init__(self, endpoint: str, domain: int, report: Report):
         """Open a session. Raises ValueError if the endpoint or the configuration is invalid. `endpoint` is that of a
@@ -63,7 +63,7 @@ class ZenohTransport:
     def subscribe(
         self, topic: str, kinds: Collection[str], receive: Receive, *, depth: int, reliable: bool, latched: bool
     ) -> None:
-        """See `ros.Transport`. `reliable` has no effect, because zenoh has no such setting of a subscriber."""
+        """See `Transport`. `reliable` has no effect, because zenoh has no such setting of a subscriber."""
 
         def take(sample: zenoh.Sample) -> None:
             """Pass a message to `receive`. The type is the last but one part of its key."""
@@ -83,7 +83,7 @@ class ZenohTransport:
             self._declared.append(self._session.declare_subscriber(key, take))
 
     def advertise(self, topic: str, kind: str, *, depth: int, latched: bool) -> Callable[[bytes], None]:
-        """See `ros.Transport`."""
+        """See `Transport`."""
         type_hash = typestore().hash_rihs01(kind)
         key = f"{self._domain}{topic}/{wire_type(kind)}/{type_hash}"
         drop = zenoh.CongestionControl.DROP
@@ -109,7 +109,7 @@ class ZenohTransport:
         return publish
 
     def published(self) -> dict[str, set[str]]:
-        """See `ros.Transport`. Asks for the tokens of publishers, whose keys end with topic, type, hash and QoS."""
+        """See `Transport`. Asks for the tokens of publishers, whose keys end with topic, type, hash and QoS."""
         topics: dict[str, set[str]] = {}
         for reply in self._session.liveliness().get(f"@ros2_lv/{self._domain}/*/*/*/MP/**", timeout=ANSWER_S):
             if reply.ok is not None:

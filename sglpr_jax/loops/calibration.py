@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sglpr_jax.bev import even_cells, rotate_image
+from sglpr_jax.data.poses import as_scan_poses
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import scan_stream
@@ -113,11 +114,7 @@ def certain_pairs(
 ) -> tuple[Evidence, Bool[np.ndarray, " m"]]:
     """Evidence of positive and negative pairs of a drive, and whether each is a loop. Arguments as in `calibrated`."""
     n = len(recording)
-    if len(odometry) != n:
-        raise ValueError(
-            f"expected odometry of {n} poses, one for each scan of {recording.name}, found {len(odometry)}"
-        )
-    drive = _Drive(params, recording, odometry)
+    drive = _Drive(params, recording, as_scan_poses(odometry, recording, of="odometry"))
     rng = np.random.default_rng(seed)
     evidence, is_loop = [], []
     for draw, frame in enumerate(rng.permutation(n)[: 2 * pairs].tolist()):

@@ -10,7 +10,7 @@ from sglpr_jax.data.mounting import Mounting, is_tilted, upright_from_lidar
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.arguments import check_is
-from sglpr_jax.loops.closure import LoopClosure, to_lidar, to_upright
+from sglpr_jax.loops.closure import LoopClosure, renumbered, to_lidar, to_upright
 from sglpr_jax.loops.comparison import NO_FITS, Candidate, Fits, KeyframeComparison, Query
 from sglpr_jax.loops.config import MIN_CELLS, DetectorConfig
 from sglpr_jax.loops.keyframes import Keyframe, StoredScans, describe_scan
@@ -23,7 +23,7 @@ from sglpr_jax.registration.bev_alignment import BevRegistration, refine
 from sglpr_jax.registration.bev_search import NO_PRIOR, CorrelationPeak, search_near
 from sglpr_jax.registration.bev_spectra import within_reach
 from sglpr_jax.retrieval.index import Index
-from sglpr_jax.se3 import inverse, transform, yaw_of
+from sglpr_jax.se3 import inverse, yaw_of
 
 KEYFRAME_DEG = 20.0
 """Rotation from the last frame at which a scan is the next frame at any distance, in degrees."""
@@ -139,7 +139,7 @@ class CandidateSearch:
     def to_lidar(self, loop: LoopClosure) -> LoopClosure:
         """Convert a loop of two frames, gravity-aligned, to one of two scans, between their LiDAR frames."""
         loop = to_lidar(loop, query=self.mountings[loop.query], match=self.mountings[loop.match])
-        return dataclasses.replace(loop, query=int(self.rows[loop.query]), match=int(self.rows[loop.match]))
+        return renumbered(loop, [self.rows])
 
     def close_loop(self, query: int, match: int) -> None:
         """Store an accepted loop between two frames."""
@@ -191,8 +191,8 @@ class CandidateSearch:
         link = self._register_with_reference(Query(len(self), keyframe.descriptor, image, self.verification), time)
         if link is None:
             return None
-        reference_from_scan = transform(float(link.x), float(link.y), float(link.yaw))
-        return self.motion.poses[self.motion.reference] @ reference_from_scan @ upright_from_lidar(keyframe.mounting)
+        upright_pose = self.motion.poses[self.motion.reference] @ link.match_from_query
+        return upright_pose @ upright_from_lidar(keyframe.mounting)
 
     def skip(self) -> None:
         """Count a scan that is not a frame."""
@@ -293,7 +293,7 @@ class CandidateSearch:
         """Add the motion up to the next frame. Returns the registration that shows it, or None.
 
         With odometry, the frame is registered with the last frame that was used to check the odometry, otherwise with
-        the keyframe of the motion. Comparisons of an earlier run (`fits`) contain the registration.
+        the reference of the motion. Comparisons of an earlier run (`fits`) contain the registration.
         """
         link = None if fits is None else fits.link
         to_upright = upright_from_lidar(mounting)
@@ -374,8 +374,7 @@ class CandidateSearch:
         reference, poses = self.motion.reference, self.motion.poses
         if frame == reference:
             return link
-        frame_from_query = transform(float(link.x), float(link.y), float(link.yaw))
-        reference_from_query = inverse(poses[reference]) @ poses[frame] @ frame_from_query
+        reference_from_query = inverse(poses[reference]) @ poses[frame] @ link.match_from_query
         return link._replace(
             x=reference_from_query[0, 3], y=reference_from_query[1, 3], yaw=yaw_of(reference_from_query)
         )

@@ -152,7 +152,7 @@ def add_scans(
       on_bad_scan: Called with id and error of a bad scan. Without it, the error is raised, and a bad scan of the
         checkpoint is read again.
       should_stop: If it returns True, no further scan is read.
-      on_progress: Called with the number of added frames.
+      on_progress: Called with the number of scans up to the last added frame.
       arguments: Further arguments that determine the frames (`settings`).
 
     Raises ValueError for a checkpoint of an earlier version, and the errors of `FrameLog` and `scan_stream`.

@@ -12,7 +12,7 @@ from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.mounting import Mounting, upright_from_lidar
 from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.registration.bev_alignment import BevRegistration
-from sglpr_jax.se3 import PlanarPose, inverse, planar_pose, transform, transform_covariance, yaw_of
+from sglpr_jax.se3 import PlanarPose, inverse, planar_pose, transform_covariance, yaw_of
 
 Reason = Literal[
     "little similarity",
@@ -158,7 +158,7 @@ def planar_loop(
     If the odometry does not measure height (`knows_height`), the storey is unknown. `sensors` are the mountings of
     query and match.
     """
-    pose = transform(float(registration.x), float(registration.y), float(registration.yaw))
+    pose = registration.match_from_query
     covariance = vertical_covariance(pose, *sensors)
     covariance[2, 2] += 0.0 if knows_height else UNKNOWN_HEIGHT_M**2
     query_from_match = np.eye(3)  # rotation of (x, y, yaw)

@@ -64,7 +64,7 @@ class Fits(NamedTuple):
     peaks: CorrelationPeak
     """Poses of the query in the frames of the other scans, and correlations."""
     link: BevRegistration | None = None
-    """Pose of the query in the frame of the motion's keyframe, from which the motion without odometry is computed."""
+    """Pose of the query in the frame of the motion's reference or, with odometry, of the last scan that checked it."""
     lookalike: float = math.nan
     """Highest coarse correlation with a scan that certainly shows another place. NaN if there is no such scan."""
 

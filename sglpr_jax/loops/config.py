@@ -15,14 +15,14 @@ MIN_PROBABILITY = 0.99
 SPACING_M = 1.0
 """Minimum distance of consecutive places of a drive in a map, in metres."""
 PlaceCount = Annotated[int, Bounds(1, 1000)]
-PlaceCountOrNone = Annotated[int, Bounds(0, 1000)]
+PlaceCountOrZero = Annotated[int, Bounds(0, 1000)]
 """Number of places whose images are compared with a query. A comparison takes milliseconds. `OrNone` accepts 0."""
 INDEPENDENT_M = 25.0
 """Travelled distance after which two frames are nearly independent, in metres: the radius of the compared images."""
 MIN_CELLS = 20
 """Minimum number of occupied cells of an image. Images with fewer come from a blocked or failed sensor."""
 CANDIDATES = 5
-"""Number of nearest places of a map that a query is compared with."""
+"""Number of places of a map that a query is compared with."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,10 +39,10 @@ class CandidateConfig:
     """Minimum correlation by the coarse comparison (`registration.bev_search`) of a match that is compared exactly."""
     min_correlation: float = 0.25
     """Minimum correlation of a candidate. Pairs below it are not loops."""
-    cohort: PlaceCountOrNone = 24
+    cohort: PlaceCountOrZero = 24
     """Number of scans of other places than query and match, those with the nearest descriptors, that are compared.
     Queries without a match are compared with `candidates` of them."""
-    near_cohort: PlaceCountOrNone = 8
+    near_cohort: PlaceCountOrZero = 8
     """Number of scans of the same passes, those with the nearest descriptors, that are compared. Their fits may
     contradict the motion."""
     recent_m: Positive = 30.0

@@ -167,7 +167,7 @@ def accept_between(
         other_rows = np.setdiff1d(all_rows, largest)
         rival = largest_consistent_set(pairs[np.ix_(other_rows, other_rows)])
         consistent = [members[row] for row in largest]
-        lengths_m = [np.ptp(motion.travelled[frames]) for frames in frames_of(consistent) if len(frames)]
+        lengths_m = [np.ptp(motion.travelled[frames]) for frames in frames_of(consistent)]
         reason: Reason = "contradicts other loops"
         if len(consistent) < MIN_LOOPS or min(lengths_m) < MIN_TRAVELLED_M:
             reason, rejected_rows = "too few neighbours", all_rows

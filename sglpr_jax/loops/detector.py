@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from sglpr_jax.data.poses import as_pose
 from sglpr_jax.data.scan import Scan
-from sglpr_jax.loops.arguments import as_pose, as_scan, as_seconds
+from sglpr_jax.loops.arguments import as_scan, as_seconds
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.closure import LoopClosure, Reason, RejectedClosure
 from sglpr_jax.loops.comparison import Candidate, Fits
@@ -48,7 +49,8 @@ class LoopDetector:
         self.loops: list[LoopClosure] = []
         """All returned loops."""
         self.rejected: list[RejectedClosure] = []
-        """All other compared pairs, except those whose later neighbours may still be added, with reasons."""
+        """Rejected pairs, with reasons. Left out are other pairs of the query of a loop, improbable pairs that the
+        motion excludes, and pairs whose later neighbours may still be added (`undecided`)."""
         self._waiting: list[Pair] = []
         """Pairs whose later neighbours may still be added."""
         self._returned: set[int] = set()
@@ -64,7 +66,8 @@ class LoopDetector:
     def nbytes(self) -> int:
         """Number of bytes of all frames and, about, of the results, without the kept spectra (17 MB at most).
 
-        With `max_places`, only the motion grows: by 305 bytes a keyframe, and up to as much in spare capacity.
+        With `max_places`, loops, rejected pairs and the motion still grow. The motion grows by 289 bytes a keyframe and
+        has up to as much in spare capacity.
         """
         return self.finder.nbytes + RESULT_BYTES * sum(map(len, (self.candidates, self.loops, self.rejected)))
 

@@ -6,7 +6,6 @@ adds the evidence of neighbouring pairs.
 """
 
 import dataclasses
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,6 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import expit
+
+from sglpr_jax.files import read_json
 
 DEFAULT = Path(__file__).with_name("probability.json")
 """File of the model fitted in the simulator. See docs/decisions.md."""
@@ -234,8 +235,4 @@ def recalibrated(model: LoopModel, evidence: Evidence, is_loop: Bool[np.ndarray,
 
 def default_model(path: Path = DEFAULT) -> LoopModel:
     """Read the shipped model, or that of another file. Raises FileNotFoundError or, if it is invalid, ValueError."""
-    try:
-        value = json.loads(path.read_text())
-    except ValueError as error:
-        raise ValueError(f"{path}: expected JSON ({error})") from error
-    return LoopModel.from_json(value, source=str(path))
+    return LoopModel.from_json(read_json(path), source=str(path))

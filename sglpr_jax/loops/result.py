@@ -31,7 +31,7 @@ class Session:
     skipped: tuple[str, ...] = ()
     """Ids of scans that cannot be read."""
     keyframes: int = 0
-    """Number of searched scans that were read and compared. The others are near one of these."""
+    """Number of scans that were compared or cannot be read. The others are near one of these."""
     empty: int = 0
     """Number of keyframes that are almost empty."""
     unregistered: int = 0
@@ -48,7 +48,8 @@ class LoopSearchResult:
     loops: tuple[LoopClosure, ...] = ()
     """Loops within each session, then those between each pair of sessions."""
     rejected: tuple[RejectedClosure, ...] = ()
-    """All other compared pairs, each with the reason for its rejection."""
+    """Rejected pairs, with reasons. Left out are other pairs of the query of a loop, and improbable pairs that the
+    motion excludes."""
     transforms: tuple[SegmentAlignment, ...] = ()
     """Transforms between the frames of sessions: for each pair, one for each accepted pair of segments, that with most
     loops first. With odometry there is at most one."""
@@ -191,10 +192,10 @@ def diagnose_no_loops(result: LoopSearchResult) -> list[str]:
         reasons.append(f"{len(session.skipped)} of {session.keyframes} scans cannot be read.")
     if result.rejected:
         reason, count = next(iter(count_reasons(result.rejected).items()))  # the most frequent one
-        return [*reasons, f"{len(result.rejected)} pairs were compared. For {count} of them: {MEANING[reason]}"]
+        return [*reasons, f"{len(result.rejected)} pairs were rejected. For {count} of them: {MEANING[reason]}"]
     source = "images" if session.odometry is None else "odometry"
     return [
         *reasons,
-        f"No pair was compared: according to the {source}, no scan came back to a place after at least "
+        f"No pair was possible: according to the {source}, no scan came back to a place after at least "
         f"{result.config.candidates.recent_m:g} m of travelled distance.",
     ]

@@ -18,12 +18,13 @@ from numpy.typing import ArrayLike
 
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.gravity import with_odometry
+from sglpr_jax.data.poses import as_scan_poses
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled, scaled_poses
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable
 from sglpr_jax.files import warn
 from sglpr_jax.loops.acceptance import AXES, accept_loops, check_odometry, register_loops
-from sglpr_jax.loops.arguments import as_poses, check_is
+from sglpr_jax.loops.arguments import check_is
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.checkpoint import add_scans
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure, convert_rejected, in_metres, renumbered, to_lidar
@@ -82,7 +83,7 @@ def find_loops(
       params: Weights of the model that describes them.
       odometry: Pose of the LiDAR at each scan, with drift (`config.drift`), for several recordings one array each.
         Candidates and loops beyond the drift are rejected. Of the others the largest consistent set is kept.
-      model: Model of the probabilities, by default the one shipped for the weights.
+      model: Model of the probabilities, by default the shipped one.
       config: Settings of the detector.
       registered: Register the full scans of each loop in 6 degrees of freedom. Loops with little overlap are rejected.
         None does so if all recordings have scans, not images, and small-gicp is installed.
@@ -173,14 +174,9 @@ def _check_input(
     recording: Recording, odometry: ArrayLike | None, *, registered: bool
 ) -> tuple[Recording, Float[np.ndarray, "n 4 4"] | None]:
     """Check a recording and its odometry before any work. Returns the recording with its odometry, and the poses."""
-    poses = None if odometry is None else as_poses(odometry, of="odometry")
-    if poses is not None and len(poses) != len(recording):
-        raise ValueError(
-            f"expected odometry of {len(recording)} poses, one for each scan of {recording.name}, found {len(poses)}"
-        )
-    if registered and recording.has_images:
-        raise ValueError(f"sequence {recording.name}: expected scans to register, found ready-made images")
+    poses = None if odometry is None else as_scan_poses(odometry, recording, of="odometry")
     if registered:
+        recording.require_scans("scans to register")
         check_installed()
     if poses is not None:
         recording = with_odometry(recording, poses)  # levels the scans of a sensor that tilts
@@ -315,9 +311,11 @@ def _search_pair(
     motion = BevOdometry.joined([match_finder.motion, query_finder.motion])
     mountings = [*match_finder.mountings, *query_finder.mountings]
     knows_height = match_finder.knows_height and query_finder.knows_height
-    model, config, drift = sessions[0].detector.model, sessions[0].detector.config, query_finder.present_drift
+    model, config = sessions[0].detector.model, sessions[0].detector.config
+    drifts = match_finder.present_drift, query_finder.present_drift
+    drift = max(drifts, key=lambda drift: drift.degrees_per_metre)  # that of the recording that drifts more
     options = {"should_stop": should_stop, "on_progress": on_progress}
-    candidates = _candidates_between(match_finder, query_finder, motion, **options)
+    candidates = _candidates_between(match_finder, query_finder, motion, drift, **options)
     pairs = [pair_of(candidate, model, motion, mountings, knows_height=knows_height) for candidate in candidates]
     probable = probable_loops(pairs, model, motion.path, drift=drift, config=config)
     improbable = [
@@ -328,12 +326,12 @@ def _search_pair(
     likely = [loop for loop in probable if loop is not None]
     consistent_sets, contradicting = accept_between(likely, motion, drift=drift)
 
+    rows = np.concatenate([match_finder.rows, query_finder.rows])  # scan of each frame of the joined motion
+
     def between_sessions(loop: LoopClosure) -> LoopClosure:
         """Convert a loop between gravity-aligned frames of the joined motion to LiDAR frames of scans."""
-        loop = to_lidar(loop, query=mountings[loop.query], match=mountings[loop.match])
-        query_row, match_row = query_finder.rows[loop.query - len(match_finder)], match_finder.rows[loop.match]
-        rows = {"query": int(query_row), "match": int(match_row)}
-        return dataclasses.replace(loop, **rows, match_session=match, query_session=query)
+        loop = renumbered(to_lidar(loop, query=mountings[loop.query], match=mountings[loop.match]), [rows])
+        return dataclasses.replace(loop, match_session=match, query_session=query)
 
     rejected = convert_rejected([*improbable, *contradicting], between_sessions)
     loops, transforms = list[LoopClosure](), list[SegmentAlignment]()
@@ -354,6 +352,7 @@ def _candidates_between(
     matches: CandidateSearch,
     queries: CandidateSearch,
     motion: BevOdometry,
+    drift: DriftModel,
     *,
     should_stop: Callable[[], bool],
     on_progress: Callable[[int], None],
@@ -369,7 +368,7 @@ def _candidates_between(
     if query_shape != match_shape:
         raise ValueError(f"expected images of one size in both recordings, found {match_shape} and {query_shape} cells")
     loops = np.concatenate([matches.loops.rows, queries.loops.rows + query_offset])
-    comparer = KeyframeComparison(motion, queries.present_drift, matches.config, matches.verification, loops)
+    comparer = KeyframeComparison(motion, drift, matches.config, matches.verification, loops)
     query_scans = queries.stored.view(first_frame=query_offset)
     for row, frame in enumerate(query_scans.frames.tolist()):
         if should_stop():

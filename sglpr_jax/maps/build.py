@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.gravity import with_odometry
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
+from sglpr_jax.data.poses import as_scan_poses
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled
 from sglpr_jax.data.scan_stream import OnBadScan
-from sglpr_jax.loops.arguments import as_poses, check_is
+from sglpr_jax.loops.arguments import check_is
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.checkpoint import add_scans
 from sglpr_jax.loops.comparison import NO_FITS, Fits
@@ -65,9 +66,7 @@ def map_recording(
       TypeError: If an argument is not a recording, parameters or an array.
     """
     check_is(recording, Recording, by="open_recording")
-    poses = as_poses(poses, of="poses")
-    if len(poses) != len(recording) or not len(recording):
-        raise ValueError(f"{recording.name}: expected a pose for each of {len(recording)} scans, found {len(poses)}")
+    poses = as_scan_poses(poses, recording, of="poses")
     recording = with_odometry(recording, poses)
     finder = CandidateSearch(params)  # describes the scans; each scan that is read becomes one of its frames
     keyframes: list[Keyframe | None] = []  # keyframe of each frame. None for an unreadable scan.

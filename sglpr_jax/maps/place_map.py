@@ -14,12 +14,13 @@ from numpy.typing import ArrayLike
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.gravity import GroundFilter
 from sglpr_jax.data.mounting import Mounting, upright_from_lidar
+from sglpr_jax.data.poses import as_poses
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled_poses, scaled_scan
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.fields import check_value
-from sglpr_jax.files import naming, replacing
-from sglpr_jax.loops.arguments import as_poses, as_scan
+from sglpr_jax.files import naming, write_bytes
+from sglpr_jax.loops.arguments import as_scan
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.closure import LoopClosure, in_metres, planar_loop, to_lidar
 from sglpr_jax.loops.comparison import KeyframeComparison, Query
@@ -52,7 +53,7 @@ class Relocalization(NamedTuple):
         return self.loop.probability
 
 
-def exclusive_answers(answers: Sequence[Relocalization], *, apart_m: float = NEGATIVE_M) -> list[Relocalization]:
+def exclusive_answers(answers: Sequence[Relocalization], *, apart_m: float) -> list[Relocalization]:
     """Keep the most probable answer of each position, and divide the probabilities so that their sum is at most 1.
 
     An answer is left out if it is within `apart_m` metres of one with a higher probability. The most probable is first.
@@ -174,9 +175,9 @@ class PlaceMap(Keyframes):
           params: Weights that made the map.
           scan: A scan, points (n, 3) in metres or an image (h, w). Points are taken from a sensor mounted like that of
             the map (`query_mounting`). For another mounting pass a `Scan`.
-          model: Model of the probabilities, by default the one shipped for the weights.
-          candidates: Number of nearest places that the query is compared with. If it fits none of them well, as many of
-            the nearest 25 places are compared, too, chosen by a coarse comparison.
+          model: Model of the probabilities, by default the shipped one.
+          candidates: Number of places that the query is compared with, chosen by a coarse comparison with the nearest
+            ones. If it fits none of them well, as many more are compared.
 
         Returns:
           The most probable pose, then poses that are more than 20 m, divided by the scale, from every more probable
@@ -274,9 +275,7 @@ class PlaceMap(Keyframes):
     def save(self, path: Path | str) -> None:
         """Write the map atomically to one file: an index file with additional arrays (`ARRAYS`)."""
         arrays = {name: getattr(self, name) for name in ARRAYS if self.tilts or not ARRAYS[name].optional}
-        content = self.index.to_bytes(arrays)
-        with replacing(Path(path)) as temporary:
-            temporary.write_bytes(content)
+        write_bytes(Path(path), self.index.to_bytes(arrays))
 
     @classmethod
     def load(cls, path: Path | str, *, weights_hash: str | None = None) -> "PlaceMap":

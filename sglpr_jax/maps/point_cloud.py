@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import minimum_filter1d
 
 from sglpr_jax.data.cloud_map import height_above_ground
+from sglpr_jax.data.poses import as_scan_poses
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import OnBadScan, scan_stream
 from sglpr_jax.files import warn
-from sglpr_jax.loops.arguments import as_poses, check_is
+from sglpr_jax.loops.arguments import check_is
 from sglpr_jax.maps.config import CloudConfig
 from sglpr_jax.se3 import transformed
 from sglpr_jax.voxels import ABOVE, VoxelCloud, voxel_numbers
@@ -65,12 +66,11 @@ def point_cloud(
     """
     if not len(recordings) or isinstance(recordings, Recording) or len(recordings) != len(poses):
         raise ValueError("expected a list of recordings and a list with the poses of each, found other arguments")
-    poses = [as_poses(recording_poses, of="poses") for recording_poses in poses]
-    for recording, recording_poses in zip(recordings, poses, strict=True):
+    for recording in recordings:
         check_is(recording, Recording, by="open_recording")
-        require_points(recording)
-        if len(recording) != len(recording_poses):
-            raise ValueError(f"{recording.name}: expected {len(recording)} poses, found {len(recording_poses)}")
+        recording.require_scans()
+    poses = [as_scan_poses(each, recording, of="poses") for each, recording in zip(poses, recordings, strict=True)]
+    for recording, recording_poses in zip(recordings, poses, strict=True):
         _warn_of_tilt(recording, recording_poses)
     done = 0
 
@@ -103,12 +103,6 @@ def point_cloud(
         again = scans(on_bad_scan and (lambda scan, error: None))  # bad scans have been reported
         stored = stored[~blocks.are_moving(stored, again) | (height_above_ground(stored) < GROUND_M)]
     return stored + origin
-
-
-def require_points(recording: Recording) -> None:
-    """Raise ValueError if the recording has ready-made images instead of scans."""
-    if recording.has_images:
-        raise ValueError(f"{recording.name}: expected scans, found ready-made images, which have no points")
 
 
 def _warn_of_tilt(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"]) -> None:

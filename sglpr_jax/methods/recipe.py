@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Literal
 
-from sglpr_jax.fields import Count, CountOrNone, NotNegative, Share, check_fields
+from sglpr_jax.fields import Count, CountOrZero, NotNegative, Share, check_fields
 from sglpr_jax.same_place import NEGATIVE_M, POSITIVE_M, SAME_PASS_FRAMES
 
 
@@ -13,7 +13,7 @@ class TupleConfig:
 
     positives: Count = 1
     """Number of positives of an anchor."""
-    negatives: CountOrNone = 10
+    negatives: CountOrZero = 10
     """Number of negatives of an anchor."""
     positive_m: NotNegative = POSITIVE_M
     """Maximum distance of a positive from its anchor, in metres."""
@@ -21,7 +21,7 @@ class TupleConfig:
     """Minimum distance of a negative from its anchor, in metres."""
     revisit_fraction: Share = 0.5
     """Fraction of tuples with positives from another visit. In the other tuples, positives are neighbouring frames."""
-    revisit_gap: CountOrNone = SAME_PASS_FRAMES
+    revisit_gap: CountOrZero = SAME_PASS_FRAMES
     """Maximum difference of the frame numbers of two scans from the same visit."""
     cluster: Count = 1
     """Number of consecutive tuples with anchors near each other, so that shared negatives are from the same street."""
@@ -30,11 +30,11 @@ class TupleConfig:
     mining: Literal["none", "hardest"] = "none"
     """`none`: random negatives, as in the paper. `hardest`: negatives whose descriptors are most similar to the
     anchor's (BEVPlace++). The anchors of a cluster then have similar descriptors instead of being near each other."""
-    hardest: CountOrNone = 10
+    hardest: CountOrZero = 10
     """Number of most similar places beyond `negative_m`, from which negatives are drawn."""
-    refresh_steps: CountOrNone = 1000
+    refresh_steps: CountOrZero = 1000
     """Number of steps after which mining recomputes the descriptors."""
-    mined_places: CountOrNone = 0
+    mined_places: CountOrZero = 0
     """Number of random places that mining then describes and draws anchors from. 0: all places."""
 
     def __post_init__(self):

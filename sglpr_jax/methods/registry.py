@@ -38,7 +38,7 @@ def method_named(name: str, params: Params | None = None, *, ready_made: bool = 
     return network(load(DEFAULT_WEIGHTS) if params is None else params)
 
 
-def method_beside(trained: Params, name: str, *, ready_made: bool, seed: int = 0) -> Method:
+def method_beside(trained: Params, name: str, *, ready_made: bool, seed: int) -> Method:
     """Return the method called `name`, one of `BesideName`, for comparison with a newly trained network.
 
     `untrained` is the same network with random weights from `seed`, `shipped` has the `DEFAULT_WEIGHTS`. A handcrafted

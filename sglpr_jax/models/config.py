@@ -13,7 +13,7 @@ from sglpr_jax.categories import RAW_IDS, Categories
 from sglpr_jax.fields import (
     NotNegative,
     Size,
-    SizeOrNone,
+    SizeOrZero,
     Sizes,
     check_fields,
     field_types,
@@ -107,7 +107,7 @@ class ModelConfig:
     """Configuration of the place head."""
     categories: Categories = 20
     """Number of categories of the labels (figure 9, docs/reference/labels.md). 0: no segmentation head."""
-    detail: SizeOrNone = 0
+    detail: SizeOrZero = 0
     """Width of a layer that adds the image to the features of the segmentation head. 0: no layer, as in the paper."""
     descriptors_of: str = ""
     """SHA-256 of the weights whose descriptors this model learned (`loss.teacher`). Maps and files of both have this

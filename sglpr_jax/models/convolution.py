@@ -79,7 +79,7 @@ def convolve_as_product(
     """
     size, border = len(kernel), _border(kernel, strides)
     rows_padded = jnp.pad(x, ((0, 0), (border, border), (0, 0), (0, 0)))
-    stacked_rows = _stack_under_kernel(rows_padded, 1, size, strides[0])
+    stacked_rows = stack_under_kernel(rows_padded, 1, size, strides[0])
     few_inputs = _has_few_inputs(kernel)
     if strides[1] == 1 and size % 2 == 1 and not few_inputs:
         matrix = kernel.swapaxes(1, 2).reshape(-1, size * kernel.shape[-1])  # (k * c, k * f)
@@ -105,7 +105,7 @@ def _multiply_patches(
     results = (stacked_rows.shape[2] - size) // stride + 1
     missing_columns = -results % results_per_patch * stride  # to complete the last patch
     padded = jnp.pad(stacked_rows, ((0, 0), (0, 0), (0, missing_columns), (0, 0)))
-    patches = _stack_under_kernel(padded, 2, size + extra_columns, results_per_patch * stride)
+    patches = stack_under_kernel(padded, 2, size + extra_columns, results_per_patch * stride)
     y = _multiply_channels(patches, matrix)
     return y.reshape(*y.shape[:2], -1, features)[:, :, :results]
 
@@ -126,7 +126,7 @@ def _pad_columns(x: Float[Array, "b h w c"], border: int, circular: bool) -> Flo
     return jnp.pad(x, sides, mode="wrap") if circular else jnp.pad(x, sides)
 
 
-def _stack_under_kernel(x: Float[Array, "b h w c"], axis: int, size: int, stride: int) -> Float[Array, "b _ _ _"]:
+def stack_under_kernel(x: Float[Array, "b h w c"], axis: int, size: int, stride: int) -> Float[Array, "b _ _ _"]:
     """For each position of a kernel along `axis`, stack the `size` pixels that it covers as channels."""
     end = (x.shape[axis] - size) // stride * stride + 1
     return jnp.concatenate([jax.lax.slice_in_dim(x, i, i + end, stride, axis) for i in range(size)], axis=-1)

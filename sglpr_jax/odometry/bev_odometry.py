@@ -85,7 +85,7 @@ class BevOdometry:
         motion, table = cls(), np.zeros(len(poses), FIELDS)
         table["travelled"] = travelled(poses) if len(poses) else 0.0
         motion._table.extend(table)
-        motion.path.extend(poses, np.zeros(len(poses)))
+        motion.path.extend(poses)
         return motion
 
     @classmethod
@@ -154,7 +154,7 @@ class BevOdometry:
             is_surprising = link.angle_to(prior[2]) > np.radians(TURN_DEG) or self._steps(time) > MOST_STEPS
             is_ambiguous = is_surprising or not self.is_trusted(link, prior)
             along_m = float(link.along_m) if self.is_ridge(link) else math.inf
-            pose = self.poses[self.reference] @ transform(float(link.x), float(link.y), float(link.yaw))
+            pose = self.poses[self.reference] @ link.match_from_query
         elif pose is None and self._coasted < MAX_COASTING:
             pose, extrapolates = self.extrapolated(time), True
         self._coasted = self._coasted + 1 if extrapolates else 0

@@ -28,6 +28,6 @@ class OdometryConfig:
             raise ValueError(f"expected min_range_m < max_range_m = {self.max_range_m:g}, found {self.min_range_m:g}")
 
     @property
-    def effective(self) -> "OdometryConfig":
-        """The same settings with the edge of the voxels that is used."""
-        return dataclasses.replace(self, voxel_m=self.max_range_m / 100 if self.voxel_m is None else self.voxel_m)
+    def used_voxel_m(self) -> float:
+        """Edge of the voxels that is used, in metres."""
+        return self.max_range_m / 100 if self.voxel_m is None else self.voxel_m

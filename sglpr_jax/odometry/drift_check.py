@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.registration.bev_alignment import BevRegistration
-from sglpr_jax.se3 import inverse, transform, yaw_of
+from sglpr_jax.se3 import inverse, yaw_of
 
 STEP_M, STEP_DEG, MOST_FRAMES = 2.5, 15.0, 20
 """Minimum distance (metres) or angle (degrees) by odometry, or number of frames, between two compared scans."""
@@ -67,7 +67,7 @@ class OdometryCheck:
         if step is None or link is None or not is_clear or np.linalg.norm(step[:3, 3]) > MAX_STEP_M:
             self._start_window()
             return
-        image_step = transform(float(link.x), float(link.y), float(link.yaw))
+        image_step = link.match_from_query
         self._by_odometry, self._by_images = self._by_odometry @ step, self._by_images @ image_step
         self._length_m += max(float(np.linalg.norm(motion[:3, 3])) for motion in (step, image_step))
         if self._length_m >= WINDOW_M:

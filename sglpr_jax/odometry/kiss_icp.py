@@ -83,8 +83,7 @@ def scan_odometry(
       odometry = scan_odometry(recording)
       found = find_loops(recording, params, odometry=odometry)
     """
-    if recording.has_images:
-        raise ValueError(f"sequence {recording.name}: expected scans for odometry, found ready-made images")
+    recording.require_scans("scans for odometry")
     check_installed()
     path = None if kept_in is None else Path(kept_in)
     with FrameLog(path, {} if path is None else _settings(recording, config, scale), restarts=True) as log:
@@ -148,11 +147,11 @@ class _FrontEnd:
     """kiss-icp, to which scans are added one after the other."""
 
     def __init__(self, config: OdometryConfig):
-        library, effective = _library(), config.effective
-        data = {"max_range": effective.max_range_m, "min_range": effective.min_range_m, "deskew": True}
-        mapping = {"voxel_size": effective.voxel_m}
+        library = _library()
+        data = {"max_range": config.max_range_m, "min_range": config.min_range_m, "deskew": True}
+        mapping = {"voxel_size": config.used_voxel_m}
         settings = importlib.import_module("kiss_icp.config").KISSConfig(data=data, mapping=mapping)
-        self._icp, self._voxel_m = library.KissICP(settings), float(effective.voxel_m or 0)
+        self._icp, self._voxel_m = library.KissICP(settings), config.used_voxel_m
         self._previous_clouds: deque[Float[np.ndarray, "n 3"]] = deque(maxlen=PREVIOUS)
         """Points of the previous scans in the frame of the first scan."""
 
@@ -238,12 +237,10 @@ def _warn_of_doubtful(recording: Recording, registered: dict[int, _RegisteredSca
 
 def describe_odometry(recording: Recording, config: OdometryConfig, *, scale: Scale) -> str:
     """Describe the odometry of a recording to the user: kiss-icp's version, range and voxels in metres, deskewing."""
-    effective = config.effective
-    assert effective.voxel_m is not None
     deskewing = "motion within scans removed" if has_point_times(recording) else "without times of points"
     return (
-        f"odometry: kiss-icp {version('kiss-icp')}, points up to {effective.max_range_m / scale:g} m, voxels of "
-        f"{effective.voxel_m / scale:g} m, {deskewing}"
+        f"odometry: kiss-icp {version('kiss-icp')}, points up to {config.max_range_m / scale:g} m, voxels of "
+        f"{config.used_voxel_m / scale:g} m, {deskewing}"
     )
 
 

@@ -17,11 +17,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, parse_numbers
+from sglpr_jax.data.poses import as_poses
 from sglpr_jax.files import in_short, parse_json, warn, write_text
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure
 from sglpr_jax.loops.odometry_deviation import step_deviations
 from sglpr_jax.odometry.drift_model import DriftModel
-from sglpr_jax.se3 import are_rotations, from_quaternions, inverse, quaternions
+from sglpr_jax.se3 import from_quaternions, have_unit_length, inverse, quaternions
 
 VERTEX, EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
 OTHER_TYPE = re.compile(r"FIX|(VERTEX|EDGE|PARAMS|CACHE)_[A-Z0-9_:]+")
@@ -138,9 +139,7 @@ def _frame_numbers(values: Float[np.ndarray, " n"], where: str) -> list[int]:
 
 def _pose_of_numbers(values: Float[np.ndarray, " 7"], where: str) -> Float[np.ndarray, "4 4"]:
     """Return the pose of x y z qx qy qz qw. Raises ValueError if the quaternion is not of length 1 (within 0.01)."""
-    with np.errstate(over="ignore"):  # the square of a damaged number may be infinite
-        length = np.linalg.norm(values[3:])
-    if abs(length - 1) > 0.01:
+    if not have_unit_length(values[None, 3:])[0]:
         raise ValueError(f"{where}: expected a quaternion of length 1, found {values[3:]}")
     return from_quaternions(values[None, :3], values[None, 3:])[0]
 
@@ -223,12 +222,11 @@ def _loop_of_json(line: bytes, where: str) -> LoopClosure:
     value = parse_json(line, source=where)
     try:
         query, match = value["query"], value["match"]
-        pose, covariance = (np.array(value[name], np.float64) for name in ("match_from_query", "covariance"))
+        (pose,) = as_poses([value["match_from_query"]], of="match_from_query")
+        covariance = np.array(value["covariance"], np.float64)
         if type(query) is not int or type(match) is not int or not 0 <= match < query:
             raise ValueError(f"match {match} and query {query}")
-        if pose.shape != (4, 4) or not are_rotations(pose[:3, :3]) or pose[3].tolist() != [0, 0, 0, 1]:
-            raise ValueError(f"an invalid pose: {pose.tolist()}")
-        if covariance.shape != (6, 6) or not np.isfinite(pose).all() or not _is_covariance(covariance):
+        if covariance.shape != (6, 6) or not _is_covariance(covariance):
             raise ValueError(f"no covariance, symmetric and positive definite: {covariance.tolist()}")
         overlap = None if value["overlap"] is None else float(value["overlap"])
         loop = LoopClosure(query, match, pose, covariance, float(value["probability"]), overlap)

@@ -1,6 +1,5 @@
 """Export of the loops of a search as a folder of files for other programs."""
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sglpr_jax.files import file_name, text_bytes, warn, write_all, write_json
-from sglpr_jax.loops.closure import LoopClosure, RejectedClosure, renumbered
+from sglpr_jax.loops.closure import LoopClosure, RejectedClosure, convert_rejected, renumbered
 from sglpr_jax.loops.frame_alignment import TrajectorySegment
 from sglpr_jax.loops.result import LoopSearchResult
 from sglpr_jax.odometry.drift_model import DriftModel
@@ -67,7 +66,7 @@ def write_loop_folder(
             chains.append((vertices[: session.frames], group_from_session @ session.odometry[: session.frames]))
     named: dict[str, Any] = {"ids": ids, "recordings": recordings if len(names) > 1 else None}
     loops = [renumbered(loop, numbers) for loop in result.loops]
-    rejected = [dataclasses.replace(pair, loop=renumbered(pair.loop, numbers)) for pair in result.rejected]
+    rejected = convert_rejected(result.rejected, lambda loop: renumbered(loop, numbers))
     comments = _comments(result, names, numbers) if len(names) > 1 else []
     files = graph_files(loops, rejected, chains, drift=result.sessions[0].drift, comments=comments, **named)
     files[LOOPS_JSONL] = partial(write_loops_jsonl, loops=loops, **named)

@@ -4,7 +4,6 @@ Graduated non-convexity (Yang et al., RA-L 2020) ignores wrong loops, which woul
 result is compared with the stated drift of the odometry.
 """
 
-import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -14,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.data.mounting import is_tilted
 from sglpr_jax.files import warn
-from sglpr_jax.loops.closure import LoopClosure, frames_of, to_upright
+from sglpr_jax.loops.closure import LoopClosure, frames_of, renumbered, to_upright
 from sglpr_jax.loops.odometry_deviation import deviations, step_deviations
 from sglpr_jax.loops.result import LoopSearchResult, Session
 from sglpr_jax.odometry.drift_model import DriftModel
@@ -193,15 +192,10 @@ def solve_pose_graph(
     Raises ImportError if the extra `gtsam` is not installed.
     """
     gtsam_library()  # raises the ImportError even if there are no loops
-    sessions = np.repeat(list(odometry), [len(poses) for poses in odometry.values()])  # of each pose, ascending
+    sessions = np.repeat(list(odometry), [len(poses) for poses in odometry.values()])  # of each pose
     poses = np.concatenate(list(odometry.values()))
-    first_row = {session: int(np.searchsorted(sessions, session)) for session in odometry}
-    loops = [
-        dataclasses.replace(
-            loop, match=first_row[loop.match_session] + loop.match, query=first_row[loop.query_session] + loop.query
-        )
-        for loop in loops
-    ]
+    rows = {session: np.flatnonzero(sessions == session) for session in odometry}
+    loops = [renumbered(loop, rows) for loop in loops]
     is_used = _odometry_deviations(loops, poses, sessions, drift) <= drift.max_deviation
     for _ in range(ROUNDS):
         if not is_used.any():

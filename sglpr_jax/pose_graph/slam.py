@@ -21,6 +21,7 @@ from sglpr_jax.odometry import kiss_icp
 from sglpr_jax.odometry.config import OdometryConfig
 from sglpr_jax.pose_graph.factor_graph import gtsam_library
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory, optimize_trajectory
+from sglpr_jax.progress import Progress, no_progress
 
 
 class Slam(NamedTuple):
@@ -32,6 +33,8 @@ class Slam(NamedTuple):
     trajectory: OptimizedTrajectory
 
     def __str__(self) -> str:
+        if self.loops.sessions[0].odometry is None:
+            return f"{self.loops}\ntrajectory not corrected: the odometry contradicts the scans and is not used"
         return f"{self.loops}\n{self.trajectory}"
 
 
@@ -45,6 +48,7 @@ def slam(
     scale: Scale = 1,
     on_bad_scan: OnBadScan | None = None,
     kept_in: Path | str | None = None,
+    progress: Progress = no_progress,
 ) -> Slam:
     """Compute the odometry of a recording from its scans, find loops and correct the trajectory.
 
@@ -60,6 +64,7 @@ def slam(
       scale: Factor for all lengths, also of the odometry.
       on_bad_scan: Called with id and error of an unreadable scan.
       kept_in: Folder of checkpoints, from which an interrupted call resumes. It is not removed.
+      progress: Progress display, for instance `sglpr_jax.progress.progress_bar`.
 
     Raises:
       ValueError: If the recording has ready-made images, or if no scan is readable or has enough points.
@@ -72,23 +77,27 @@ def slam(
     gtsam_library()  # an error before the search
     scans = recording if isinstance(recording, Recording) else open_recording(Path(recording))
     folder = None if kept_in is None else Path(kept_in)
-    poses = kiss_icp.scan_odometry(
-        scans,
-        config=odometry,
-        scale=scale,
-        kept_in=None if folder is None else folder / "odometry.log",
-        on_bad_scan=on_bad_scan,
-    )
-    loops = find_loops(
-        deskewed(scans, poses) if has_point_times(scans) else scans,
-        load(params) if isinstance(params, str) else params,
-        odometry=poses,
-        config=config,
-        registered=registered,
-        scale=scale,
-        on_bad_scan=on_bad_scan,
-        kept_in=None if folder is None else folder / "loops",
-    )
+    with progress(f"odometry {scans.name}", len(scans)) as show:
+        poses = kiss_icp.scan_odometry(
+            scans,
+            config=odometry,
+            scale=scale,
+            kept_in=None if folder is None else folder / "odometry.log",
+            on_bad_scan=on_bad_scan,
+            on_progress=show,
+        )
+    with progress(f"loops {scans.name}", len(scans)) as show:
+        loops = find_loops(
+            deskewed(scans, poses) if has_point_times(scans) else scans,
+            load(params) if isinstance(params, str) else params,
+            odometry=poses,
+            config=config,
+            registered=registered,
+            scale=scale,
+            on_bad_scan=on_bad_scan,
+            kept_in=None if folder is None else folder / "loops",
+            on_progress=show,
+        )
     if loops.sessions[0].odometry is None:  # the scans contradict it, as a warning has said
         return Slam(poses, loops, OptimizedTrajectory(poses, np.zeros(len(loops.loops), bool)))
     return Slam(poses, loops, optimize_trajectory(loops))

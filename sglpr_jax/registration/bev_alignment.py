@@ -25,7 +25,7 @@ from sglpr_jax.registration.bev_spectra import (
     rotate,
     spectrum,
 )
-from sglpr_jax.se3 import wrap_angle
+from sglpr_jax.se3 import transform, wrap_angle
 
 NOISE, NOISE_CELLS, NOISE_RANGE_M = 0.8, 300.0, 10.0
 """Noise of the correlation: `NOISE` (1 - c) / c for a peak of height c, times 1 / occupied cells + 1 / `NOISE_CELLS`.
@@ -101,7 +101,7 @@ def _ridge_covariance(
     shifts = along_m[None, :, None] * jnp.stack([jnp.cos(headings), jnp.sin(headings)], axis=1)[:, None]
     points = pose[None, None, :2] + shifts  # samples by rotation, distance along the ridge, and axis
     area = _shared_area(jnp.hypot(points[..., 0], points[..., 1]), config.reach_m)
-    heights = jax.vmap(functools.partial(_heights, cell_m=DENSITY_RESOLUTION_M))(products, points) / area
+    heights = jax.vmap(_heights)(products, points) / area
     share = heights.max(0) / jnp.maximum(heights[0, middle], 1e-6)
     falling_before, falling_after = jax.lax.cummin(share[middle::-1])[::-1], jax.lax.cummin(share[middle:])
     share = jnp.concatenate([falling_before, falling_after[1:]])
@@ -113,7 +113,7 @@ def _ridge_covariance(
     return jnp.einsum("k,ki,kj->ij", weight * beyond_peak, offsets, offsets) / weight.sum()
 
 
-def _heights(product: Complex[Array, "s f"], points: Float[Array, "k 2"], cell_m: float) -> Float[Array, " k"]:
+def _heights(product: Complex[Array, "s f"], points: Float[Array, "k 2"]) -> Float[Array, " k"]:
     """Correlation without high frequencies at points (x, y) in metres, up to a common factor.
 
     `product` is the Fourier transform (`rfft2`) of the correlation. Only frequencies below `RIDGE_BAND` are used.
@@ -121,7 +121,7 @@ def _heights(product: Complex[Array, "s f"], points: Float[Array, "k 2"], cell_m
     size = product.shape[0]
     band = int(RIDGE_BAND * size)
     low = jnp.concatenate([product[-band:, :band], product[:band, :band]])
-    phases = points * np.float32(2 * np.pi / (cell_m * size))
+    phases = points * np.float32(2 * np.pi / (DENSITY_RESOLUTION_M * size))
     rows = jnp.exp(-1j * phases[:, 1:] * np.arange(-band, band, dtype=np.float32)[None])  # rows run down, y runs up
     columns = jnp.exp(1j * phases[:, :1] * np.arange(band, dtype=np.float32)[None])
     counts = np.where(np.arange(band) == 0, 1, 2).astype(np.float32)  # half of a real image's spectrum is stored
@@ -148,6 +148,11 @@ class BevRegistration(NamedTuple):
     """Correlation at the peak: 1 for equal images, about 0 for unrelated ones."""
     peak_ratio: Float[AnyArray, "*b"]
     """Correlation at the best other pose divided by that at this pose. It is near 1 if both fit."""
+
+    @property
+    def match_from_query(self) -> Float[np.ndarray, "4 4"]:
+        """Pose of the query in the frame of the match. Not for arrays of poses."""
+        return transform(float(self.x), float(self.y), float(self.yaw))
 
     @property
     def along_m(self) -> float:

@@ -12,31 +12,22 @@ FULL = "full"
 NO_SEGMENTATION = "no-segmentation"
 
 
-@dataclass(frozen=True)
-class Variant:
-    """A variant of the model or its training: changes to the configuration of the preset."""
-
-    label: str
-    """Name in tables."""
-    changes: Mapping[str, Any] = field(default_factory=dict)
-    """Fields of TrainConfig with their dotted names, as on the command line of bin/train."""
-
-
-VARIANTS: dict[str, Variant] = {
-    FULL: Variant("SG-LPR"),
-    "no-rotation": Variant("SG-LPR, not rotated in training", {"rotate": False}),
-    "convolutions": Variant("convolutions", {"model.head.cbam": False, "model.head.pooling": "mean"}),
-    "no-cbam": Variant("convolutions, NetVLAD", {"model.head.cbam": False}),
-    NO_SEGMENTATION: Variant("no segmentation branch", {"model.categories": 0}),
-    "counts": Variant("RB: counts", {"model.head.input": "counts"}),
-    "labels": Variant("RS: labels", {"model.head.input": "labels"}),
-    "counts-and-labels": Variant("RB+RS: counts and labels", {"model.head.input": "counts+labels"}),
-    "no-dice": Variant("triplet, cross-entropy", {"loss.dice_weight": 0.0}),
-    "no-cross-entropy": Variant("triplet, Dice", {"loss.ce_weight": 0.0}),
-    "raw-counts": Variant("counts as they are", {"model.counts": "raw"}),
-    "clipped-counts": Variant("min(n, 10) / 10", {"model.counts": "clipped"}),
-    **{f"categories-{n}": Variant(f"{n} categories", {"model.categories": n}) for n in (6, 15, 25, 34)},
+VARIANTS: dict[str, Mapping[str, Any]] = {
+    FULL: {},
+    "no-rotation": {"rotate": False},
+    "convolutions": {"model.head.cbam": False, "model.head.pooling": "mean"},
+    "no-cbam": {"model.head.cbam": False},
+    NO_SEGMENTATION: {"model.categories": 0},
+    "counts": {"model.head.input": "counts"},
+    "labels": {"model.head.input": "labels"},
+    "counts-and-labels": {"model.head.input": "counts+labels"},
+    "no-dice": {"loss.dice_weight": 0.0},
+    "no-cross-entropy": {"loss.ce_weight": 0.0},
+    "raw-counts": {"model.counts": "raw"},
+    "clipped-counts": {"model.counts": "clipped"},
+    **{f"categories-{n}": {"model.categories": n} for n in (6, 15, 25, 34)},
 }
+"""Changes of each variant to the preset: fields of `TrainConfig` by their dotted names, as flags of bin/train."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +131,7 @@ EXPERIMENTS: dict[str, Experiment] = {
 def variant_config(preset: TrainConfig, variant: str) -> TrainConfig:
     """Return the preset with the changes of a variant, which is a name in `VARIANTS`."""
     config = preset
-    for name, value in VARIANTS[variant].changes.items():
+    for name, value in VARIANTS[variant].items():
         config = _with_field(config, name, value)
     return without_untrained_head(config)
 

@@ -9,10 +9,9 @@ import jax
 
 from sglpr_jax.data.readers import recording_names
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.methods.handcrafted import HANDCRAFTED
-from sglpr_jax.methods.method import Takes
-from sglpr_jax.methods.registry import method_with_weights
-from sglpr_jax.reproduce.experiments import EXPERIMENTS, VARIANTS
+from sglpr_jax.methods.method import LABELLED, Takes
+from sglpr_jax.methods.registry import handcrafted, method_with_weights
+from sglpr_jax.reproduce.experiments import EXPERIMENTS
 from sglpr_jax.reproduce.reproduction import Reproduction, content_of
 from sglpr_jax.revisits import revisits
 from sglpr_jax.training.batch_source import training_batches
@@ -63,8 +62,7 @@ def check_inputs(reproduction: Reproduction, names: Sequence[str], nclt: Path | 
 def _check_methods(reproduction: Reproduction) -> None:
     """Raise ValueError for an unknown method, or if a test recording lacks the points or labels that a method needs."""
     for name in reproduction.methods:
-        if name not in HANDCRAFTED:
-            raise ValueError(f"expected a handcrafted method, found {name!r}; available: {', '.join(HANDCRAFTED)}")
+        handcrafted(name, None)  # raises an error if the name is unknown
     for flag, names in (("--method", reproduction.methods), ("--weights", reproduction.weights)):
         missing = {name: needs for name in names if (needs := _missing_input(reproduction, content_of(name)))}
         if missing:
@@ -78,9 +76,9 @@ def _missing_input(reproduction: Reproduction, takes: Takes) -> str:
     """Return what a test recording lacks, or an empty text. `takes` is what a method needs."""
     for seq in reproduction.seqs:
         recording = reproduction.recording(seq)
-        if takes != "images" and recording.has_images:
+        if takes.endswith("points") and recording.has_images:
             return f"points, found images in sequence {seq}"
-        if takes == "labelled points" and not recording.has_labels:
+        if takes in LABELLED and not recording.has_labels:
             return f"labels, found none in sequence {seq}"
     return ""
 
@@ -101,7 +99,7 @@ class Plan(NamedTuple):
         lines = [f"{len(self.runs)} leave-one-out runs of {self.steps} steps, {trained} of them already trained"]
         for variant in dict.fromkeys(variant for variant, _ in self.missing):
             recordings = ", ".join(seq for missing_variant, seq in self.missing if missing_variant == variant)
-            lines.append(f"  {VARIANTS[variant].label}: to train for {recordings}")
+            lines.append(f"  {variant}: to train for {recordings}")
         if self.without_revisits:
             lines.append(f"no revisits in {', '.join(self.without_revisits)}: no scores for them, and no means")
         if self.missing and seconds_per_step is not None:

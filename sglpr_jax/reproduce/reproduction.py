@@ -14,8 +14,6 @@ from sglpr_jax.evaluation.protocols import PROTOCOLS
 from sglpr_jax.evaluation.protocols.result import Result
 from sglpr_jax.files import file_name, read_json, write_json
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
-from sglpr_jax.methods.learned import LEARNED
-from sglpr_jax.methods.learned.trained import method_of
 from sglpr_jax.methods.method import Method, Takes
 from sglpr_jax.methods.registry import handcrafted, method_with_weights, network
 from sglpr_jax.models.weights import Params
@@ -171,7 +169,4 @@ class Reproduction:
 
 def content_of(method: str) -> Takes:
     """Return what a method needs in a recording. `method` is a handcrafted method, or the name or folder of weights."""
-    if method in HANDCRAFTED:
-        return HANDCRAFTED[method].takes
-    learned_method = method_of(Path(method))
-    return LEARNED[learned_method].takes if learned_method in LEARNED else "images"
+    return HANDCRAFTED[method].takes if method in HANDCRAFTED else method_with_weights(method).takes

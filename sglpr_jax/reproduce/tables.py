@@ -10,6 +10,7 @@ from sglpr_jax.evaluation.protocols.recall import BEVPLACE_NCLT_RECALL
 from sglpr_jax.evaluation.published import TABLES
 from sglpr_jax.evaluation.report import PrintsItself, TextTable, score_or_none
 from sglpr_jax.files import write_json, write_text
+from sglpr_jax.methods.method import LABELLED
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, TOP1
 from sglpr_jax.reproduce.reproduction import Reproduction, content_of
 
@@ -128,7 +129,7 @@ def _table_across_sessions(reproduction: Reproduction, name: str) -> PaperTable:
     rows = []
     for method, label in reproduction.labels(name).items():
         is_variant = method not in (*reproduction.weights, *reproduction.methods)
-        if not is_variant and content_of(method) == "labelled points" and not database.has_labels:
+        if not is_variant and content_of(method) in LABELLED and not database.has_labels:
             continue
         database_file = reproduction.descriptors(method, seq, of=database)
         scores = {}

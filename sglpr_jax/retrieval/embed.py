@@ -14,7 +14,7 @@ from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scale_of
 from sglpr_jax.data.scan import Scan
-from sglpr_jax.data.scan_stream import OnBadScan, check_readable, require_content, scan_stream
+from sglpr_jax.data.scan_stream import SCANS_AHEAD, OnBadScan, check_readable, require_content, scan_stream
 from sglpr_jax.data.submap import SUBMAPS
 from sglpr_jax.fields import Size, check_value
 from sglpr_jax.files import warn
@@ -24,9 +24,6 @@ from sglpr_jax.models.config import WHITENING_POWER, ModelConfig
 from sglpr_jax.models.input_image import field_of_view
 from sglpr_jax.models.weights import Params, with_whitening, without_whitening
 from sglpr_jax.retrieval.descriptor_file import SKIPPED, DescriptorFile
-
-SCANS_AHEAD = 8
-"""Number of scans that are read ahead."""
 
 
 def embed(

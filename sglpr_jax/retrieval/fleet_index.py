@@ -23,7 +23,7 @@ class FleetIndex:
     """Index of place descriptors, compared by L2, that any number of processes fill and query.
 
     Example:
-      index = FleetIndex("s3://bucket/index", weights_hash=params.weights_hash)   # or a folder
+      index = FleetIndex("s3://bucket/index", weights_hash=file.weights_hash)   # or a folder
       index.add(place_rows(file, "town-1", site="berlin"))
       near = index.query(descriptor, 3, where="site = 'berlin' AND recording != 'town-1'")
     """

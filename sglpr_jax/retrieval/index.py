@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.formats.tensors import tensors_as_bytes
 from sglpr_jax.fields import Size, check_value
-from sglpr_jax.files import in_short, naming, parse_json, replacing
+from sglpr_jax.files import in_short, naming, parse_json, write_bytes
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.retrieval.descriptor_file import COLUMNS, DescriptorFile, check_made_alike
 from sglpr_jax.retrieval.distances import distance_function, smallest
@@ -232,9 +232,7 @@ class Index:
 
     def save(self, path: Path | str) -> None:
         """Write the index to one safetensors file, atomically. Its header contains the ids and metadata as JSON."""
-        content = self.to_bytes()
-        with replacing(Path(path)) as temporary:
-            temporary.write_bytes(content)
+        write_bytes(Path(path), self.to_bytes())
 
     def to_bytes(self, additional: Mapping[str, np.ndarray] | None = None) -> bytes:
         """Return the content of the file that `save` writes, with additional arrays that `load_with_arrays` returns."""

@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from sglpr_jax.files import check_still_there, read_json, replacing
+from sglpr_jax.data.readers.simulation import SIMULATION
+from sglpr_jax.files import check_still_there, read_json, write_bytes
 from sglpr_jax.sim import RATE_HZ, SCANS
 from sglpr_jax.sim.drive import CARRIERS, check_rate_and_seed, name_of_path, read_path, scan_rows
 from sglpr_jax.sim.layouts import LAYOUTS, Layout
@@ -27,7 +28,6 @@ from sglpr_jax.sim.sceneries import REPEATING
 from sglpr_jax.sim.sensor import SENSORS, Sensor
 from sglpr_jax.sim.styles import SCENERIES, TOWN
 
-SETTINGS_FILE = "simulation.json"
 VERSION = 3  # version of the simulator's output; it changes whenever the scans of a seed change
 OLD_NAMES = {"crossing_every": "crossing_every_m", "wavelength": "wavelength_m"}  # current names of old fields
 WORKERS = 2  # rendering threads; the compiled program leaves capacity for more than one
@@ -168,7 +168,7 @@ def simulate(
             on_progress(k * scans + done * scans // count)
 
         _write_drive(out, plan, LAYOUTS[layout], on_scan)
-    check_still_there(out / SETTINGS_FILE)
+    check_still_there(out / SIMULATION)
     return dataset
 
 
@@ -270,9 +270,9 @@ def _claim(root: Path, settings: dict, fingerprints: dict[str, str]) -> None:
 
     Raises ValueError if `root` holds other files, or other settings or fingerprints.
     """
-    path = root / SETTINGS_FILE
+    path = root / SIMULATION
     if not path.exists() and root.is_dir() and any(not file.name.startswith(".") for file in root.iterdir()):
-        raise ValueError(f"{root} holds files that were not simulated (no {SETTINGS_FILE}); choose another folder")
+        raise ValueError(f"{root} holds files that were not simulated (no {SIMULATION}); choose another folder")
     stored = _read_settings(path) if path.exists() else {}
     expected = json.loads(json.dumps({**settings, **fingerprints}))  # as read from JSON: tuples become lists
     not_in_older = {name: expected[name] for name in ("height_m",) if name in expected}
@@ -282,7 +282,7 @@ def _claim(root: Path, settings: dict, fingerprints: dict[str, str]) -> None:
         described = ", ".join(f"{key} {expected[key]} (found {stored.get(key)})" for key in different)
         raise ValueError(f"{path} belongs to another simulated dataset; expected {described}; choose another folder")
     if merged != stored:
-        _write(path, json.dumps(merged, indent=1, sort_keys=True).encode())
+        write_bytes(path, json.dumps(merged, indent=1, sort_keys=True).encode())
 
 
 def _read_settings(path: Path) -> dict:
@@ -314,7 +314,7 @@ def _write_drive(root: Path, plan: PlannedRecording, layout: Layout, progress: C
     def write_scan(i: int) -> None:
         contents = layout.scan_contents(*recording.render(i), recording.mounting)
         for file, content in zip(files[i], contents, strict=True):
-            _write(file, content)
+            write_bytes(file, content)
 
     with ThreadPoolExecutor(WORKERS) as pool:
         try:
@@ -324,10 +324,4 @@ def _write_drive(root: Path, plan: PlannedRecording, layout: Layout, progress: C
             pool.shutdown(cancel_futures=True)
             raise
     for file, content in layout.drive_contents(recording.poses).items():
-        _write(layout.file_of_drive(root, plan.name, file), content)
-
-
-def _write(path: Path, content: bytes) -> None:
-    """Writes a file atomically."""
-    with replacing(path) as temporary:
-        temporary.write_bytes(content)
+        write_bytes(layout.file_of_drive(root, plan.name, file), content)

@@ -229,12 +229,11 @@ class Carrier:
     def motion(
         self, rng: np.random.Generator, times: Float[np.ndarray, " n"], *, height_m: float
     ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"] | float, Float[np.ndarray, " n"] | float]:
-        """Draws the motion of the sensor at `times`. If the carrier has no height, the mean height is `height_m`.
+        """Draws the motion of the sensor at `times`, around a mean height of `height_m` metres above the ground.
 
         Returns:
           Pitch and roll in radians, height above the ground, and distance to the left of the path, in metres.
         """
-        height_m = height_m if self.height_m is None else self.height_m
         if not self.walks:
             return _body_tilt(rng, times) * (self.tilt_deg / TILT_DEG), height_m, 0.0
         swing, bob = _steps(rng, times)

@@ -68,7 +68,7 @@ def _poisson_positions(rng: np.random.Generator, per_metre: float, start: float,
     return rng.uniform(start, stop, rng.poisson(per_metre * (stop - start))).tolist()
 
 
-def stays(rng: np.random.Generator, clock: Clock, occupied: float, stay_s: float = STAY_S) -> Iterator[Clock]:
+def stays(rng: np.random.Generator, clock: Clock, occupied: float) -> Iterator[Clock]:
     """Yields start and end of the stays at a place that is occupied for the fraction `occupied` of the time.
 
     If the place is occupied at the start of `clock`, the first stay begins at -inf.
@@ -76,7 +76,7 @@ def stays(rng: np.random.Generator, clock: Clock, occupied: float, stay_s: float
     time = clock[0]
     is_occupied = rng.random() < occupied
     while time < clock[1]:
-        duration = rng.exponential(stay_s if is_occupied else stay_s * (1 - occupied) / occupied)
+        duration = rng.exponential(STAY_S if is_occupied else STAY_S * (1 - occupied) / occupied)
         if is_occupied:
             yield (-np.inf if time == clock[0] else time, time + duration)
         time += duration

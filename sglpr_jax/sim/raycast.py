@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from sglpr_jax.se3 import wrap_angle
 from sglpr_jax.sim import labels
 from sglpr_jax.sim.shapes import SOLIDS, AnyArray, Scene, Shapes, Solid, Vectors, at_time
 
@@ -84,15 +85,10 @@ def find_candidates(
     for shapes, slot_count in zip(scene, slots, strict=True):
         present = at_time(shapes, time, sensor_xyz, reach_m=reach_m)
         shape_middle, shape_half_width = _azimuth_intervals(present, world_from_lidar)
-        angle = np.abs(_wrapped(shape_middle[:, None] - sector_middle))
+        angle = np.abs(wrap_angle(shape_middle[:, None] - sector_middle))
         overlap = angle <= shape_half_width[:, None] + sector_half_width
         candidates.append(_nearest_shapes(present, sensor_xyz, overlap, slot_count))
     return tuple(candidates)
-
-
-def _wrapped(angle: np.ndarray) -> np.ndarray:
-    """Wraps angles to [-pi, pi)."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def _azimuth_intervals(shapes: Shapes, world_from_lidar: Float[np.ndarray, "4 4"]) -> tuple[np.ndarray, np.ndarray]:
@@ -108,7 +104,7 @@ def _azimuth_intervals(shapes: Shapes, world_from_lidar: Float[np.ndarray, "4 4"
     lidar_yx = world_from_lidar[:3, 1::-1]  # axes y and x of the LiDAR, in the order of arctan2
     corner_azimuth = np.arctan2(*np.moveaxis(corners @ lidar_yx, -1, 0))
     centre_azimuth = np.arctan2(*(offset @ lidar_yx).T)
-    deviation = _wrapped(corner_azimuth - centre_azimuth[:, None])
+    deviation = wrap_angle(corner_azimuth - centre_azimuth[:, None])
     low, high = deviation.min(axis=1), deviation.max(axis=1)
     # A shape that spans half a revolution or more is around, above or below the sensor, so any ray may hit it.
     return centre_azimuth + (low + high) / 2, np.where(high - low < np.pi, (high - low) / 2, np.pi)

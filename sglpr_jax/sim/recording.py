@@ -16,7 +16,7 @@ from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.submap import submaps
-from sglpr_jax.sim import RATE_HZ
+from sglpr_jax.sim import RATE_HZ, SCANS
 from sglpr_jax.sim.drive import (
     VEHICLE,
     Carrier,
@@ -71,7 +71,7 @@ def simulate_recording(
     name: str = "00",
     *,
     along: Path | None = None,
-    scans: int = 300,
+    scans: int = SCANS,
     sensor: Sensor = HDL64E,
     seed: int = 0,
     rate_hz: float = RATE_HZ,
@@ -113,7 +113,7 @@ def simulate_recording(
 def simulate_repeating(
     name: str,
     *,
-    scans: int = 300,
+    scans: int = SCANS,
     seed: int = 0,
     sensor: Sensor = HDL64E,
     revisit: Revisit = "none",
@@ -127,7 +127,7 @@ def simulate_repeating(
       name: Scenery, from `REPEATING`.
       scans: Number of scans, evenly spaced over the drive.
       seed: Seed of the scenery and the drive, at least 0.
-      sensor: LiDAR. In sceneries of small robots it is mounted lower and has a minimum range of at most 0.5 m.
+      sensor: LiDAR. A height of the carrier or the scenery replaces its own, with a minimum range of at most 0.5 m.
       revisit: "none": frames 30 s apart are farther apart than the scenery's `other_m`. "opposite": returns along the
         same path. "same": drives one and a half laps along a closed path.
       rate_hz: Scans per second. None uses the rate of the carrier or of the scenery.
@@ -189,7 +189,7 @@ def plan_sessions(
     dates: Sequence[str],
     *,
     route: str = "00",
-    scans: int = 300,
+    scans: int = SCANS,
     sensor: Sensor = SENSORS["hdl32e-nclt"],
     seed: int = 0,
     rate_hz: float = RATE_HZ,
@@ -282,7 +282,8 @@ def drive_through(
     """
     path_times, yaw = path.times[rows], path.yaw[rows]
     ids, times = ids or numbered_ids(len(rows)), path_times if times is None else times
-    tilt, height, left_m = carrier.motion(rng, path_times, height_m=sensor.height_m)
+    height_m = sensor.height_m if carrier.height_m is None else carrier.height_m
+    tilt, height, left_m = carrier.motion(rng, path_times, height_m=height_m)
     sway = np.reshape(left_m + aside_m, (-1, 1)) * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
     true_poses = poses_on(world.ground.relief, path.xy[rows] + sway, yaw, height_m=height, tilt=tilt)
     rendered_poses = true_poses
@@ -291,7 +292,6 @@ def drive_through(
         rendered_poses = poses_on(world.ground.relief, xy + sway, yaw, height_m=height, tilt=tilt)
         true_poses = poses_on((ground_height, slope), path.xy[rows] + sway, yaw, height_m=height, tilt=tilt)
     speed = speeds(path)[rows]
-    height_m = sensor.height_m if carrier.height_m is None else carrier.height_m
     row_of_id = {scan_id: i for i, scan_id in enumerate(ids)}
 
     @functools.lru_cache(maxsize=KEPT_SCANS)

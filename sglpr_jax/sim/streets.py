@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from sglpr_jax.sim.ground import CELL_M, Ground, Relief
 from sglpr_jax.sim.labels import LANE_MARKING, OTHER_GROUND, ROAD, TERRAIN
-from sglpr_jax.sim.routes import Line
+from sglpr_jax.sim.routes import Line, travelled
 from sglpr_jax.sim.styles import STYLES, TOWN, Scenery, Side, draw_side
 
 MIDDLE_M = 1.2  # distance from the first pass to the middle of the street on its left, in metres
@@ -75,13 +75,13 @@ def resample(trajectory: Line, times: Float[np.ndarray, " n"]) -> Path:
     """
     if len(trajectory) < 2 or not (np.isfinite(trajectory).all() and np.all(np.diff(times) > 0)):
         raise ValueError("a trajectory needs two or more finite points at increasing times")
-    travelled = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(trajectory, axis=0), axis=1))])
-    moved = np.concatenate([[True], np.diff(travelled) > 1e-6])
-    if travelled[-1] < 2:
-        raise ValueError(f"a trajectory needs a length of 2 m or more, found {travelled[-1]:.2f} m")
-    even_m = np.linspace(0, travelled[-1], int(travelled[-1]) + 1)
-    xy = np.stack([np.interp(even_m, travelled[moved], axis) for axis in trajectory[moved].T], axis=1)
-    seconds = np.interp(even_m, travelled[moved], times[moved])
+    length_m = travelled(trajectory)
+    moved = np.concatenate([[True], np.diff(length_m) > 1e-6])
+    if length_m[-1] < 2:
+        raise ValueError(f"a trajectory needs a length of 2 m or more, found {length_m[-1]:.2f} m")
+    even_m = np.linspace(0, length_m[-1], int(length_m[-1]) + 1)
+    xy = np.stack([np.interp(even_m, length_m[moved], axis) for axis in trajectory[moved].T], axis=1)
+    seconds = np.interp(even_m, length_m[moved], times[moved])
     direction = np.gradient(gaussian_filter1d(xy, 2.0, axis=0, mode="nearest"), axis=0)
     seconds_per_point = gaussian_filter1d(np.gradient(seconds), 10.0, mode="nearest")
     heading = np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))

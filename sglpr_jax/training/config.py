@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Annotated, Literal
 
-from sglpr_jax.fields import Bounds, Count, CountOrNone, Degrees, NotNegative, Positive, Share, check_fields
+from sglpr_jax.fields import Bounds, Count, CountOrZero, Degrees, NotNegative, Positive, Share, check_fields
 from sglpr_jax.methods.recipe import TupleConfig
 from sglpr_jax.models.config import ModelConfig
 
@@ -74,7 +74,7 @@ class OptimizerConfig:
     suits layers of any width (Muon, Jordan 2024). Adam updates the vectors with a tenth of the learning rate."""
     learning_rate: NotNegative = 1e-5
     """Learning rate after the warm-up."""
-    warmup_steps: CountOrNone = 0
+    warmup_steps: CountOrZero = 0
     """Steps in which the learning rate rises linearly from 0."""
     decay_rate: Positive = 0.99
     """Factor of the learning rate after each `decay_steps` steps."""
@@ -130,12 +130,12 @@ class TrainConfig:
     """Tuples per step."""
     share_negatives: bool = False
     """Use the places of all tuples of a step as negatives, if they are far enough away."""
-    also_tuples: CountOrNone = 0
+    also_tuples: CountOrZero = 0
     """Tuples per step from the second dataset, included in `tuples`."""
     also_triplets: bool = False
     """Include the tuples of the second dataset in the triplet loss. Otherwise they are random places for the
     segmentation losses alone."""
-    chunk: CountOrNone = 0
+    chunk: CountOrZero = 0
     """Images that pass through the network at a time, on all devices together; 0: all. Fewer images need less memory.
     Results differ only by the random branches that stochastic depth drops."""
     rotate: bool = True
@@ -147,7 +147,7 @@ class TrainConfig:
     max_points: Count = 131072
     """Maximum number of points of a scan. Smaller scans are padded to this size, and larger scans are thinned
     evenly."""
-    seed: CountOrNone = 0
+    seed: CountOrZero = 0
     """Seed of the weights and of all random choices."""
     log_every: Count = 10
     """Steps between lines of the log."""

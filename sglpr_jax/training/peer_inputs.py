@@ -2,7 +2,6 @@
 
 import hashlib
 import inspect
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,16 +9,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int, Shaped
 
+from sglpr_jax.data.fingerprint import fingerprint
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.scan_stream import check_readable, require_content, scan_stream
+from sglpr_jax.data.scan_stream import SCANS_AHEAD, check_readable, require_content, scan_stream
 from sglpr_jax.files import file_name, in_short, replacing
 from sglpr_jax.methods.learned.method import LearnedMethod
 from sglpr_jax.methods.method import LABELLED
 from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.training.tuples import TuplePool, positions_of
-
-SCANS_AHEAD = 8
-"""Number of scans that are read ahead."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,15 +92,6 @@ def _require_same_shape(inputs: np.ndarray, expected: np.ndarray, *, name: str) 
 
 
 def _cache_key(method: LearnedMethod, recording: Recording) -> str:
-    """Return a hash of what determines the inputs: method, source file of `prepare`, scan files and read options."""
-    files: list[tuple[str, tuple[int, int] | None]] = []
-    for path in (*recording.paths, *recording.label_paths, *recording.containers):
-        if path is not None:
-            stat = path.stat() if path.exists() else None  # None for a scan inside another file
-            files.append((str(path.absolute()), None if stat is None else (stat.st_size, stat.st_mtime_ns)))
-    mountings = [str(recording.mounting_of(row)) for row in range(len(recording))]
-    code = hashlib.sha256(Path(inspect.getfile(method.prepare)).read_bytes()).hexdigest()
-    content = [method.name, code, recording.name, recording.read_options, files, mountings]
-    if not recording.on_disk and recording.positions is not None:  # a simulated recording has no files
-        content.append(recording.positions.tolist())
-    return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
+    """Return a hash of what determines the inputs: the recording, and the source file of `prepare`."""
+    code = Path(inspect.getfile(method.prepare)).read_bytes()
+    return hashlib.sha256(fingerprint(recording).encode() + code).hexdigest()[:16]

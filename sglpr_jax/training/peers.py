@@ -14,7 +14,7 @@ import optax
 from jax.sharding import AxisType, Mesh
 from jaxtyping import Array, Float, Float32, Int, Shaped
 
-from sglpr_jax.fields import CountOrNone, NotNegative, Positive, check_fields
+from sglpr_jax.fields import CountOrZero, NotNegative, Positive, check_fields
 from sglpr_jax.files import read_json, write_json
 from sglpr_jax.methods.learned.method import LearnedMethod, Tuples, Variables
 from sglpr_jax.methods.learned.trained import describe_inputs, learned_distance, random_variables, save_variables
@@ -53,10 +53,10 @@ class RunSettings:
     """Settings of a run. The recipe of its method has the others."""
 
     learning_rate: Positive
-    seed: CountOrNone = 0
+    seed: CountOrZero = 0
     seconds: NotNegative = 3600.0
     """Training time in seconds. Scores and the compilation of the step do not count."""
-    images: CountOrNone = 0
+    images: CountOrZero = 0
     """Number of images after which the training stops; 0: no limit."""
 
     def __post_init__(self):
@@ -69,7 +69,7 @@ class PeerBatch(NamedTuple):
     inputs: Shaped[Any, "b ..."]
     """Input of each place, tuple after tuple."""
     anchor_distance_m: Float[Any, "t k"]
-    """Distance of each place from the anchor of its tuple, in metres. Infinite between recordings."""
+    """Distance of each place from the anchor of its tuple, in metres. Infinite between worlds (`Recording.world`)."""
 
 
 @dataclasses.dataclass(frozen=True)

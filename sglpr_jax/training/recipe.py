@@ -15,7 +15,7 @@ from sglpr_jax.data.packed import packed
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.models.sglpr import init
 from sglpr_jax.models.weights import Params, adopt, graft, weights_hash, without_whitening
-from sglpr_jax.models.weights_file import load, save
+from sglpr_jax.models.weights_file import LAST_WEIGHTS, load, save
 from sglpr_jax.training.batch_source import TupleBatches, training_batches
 from sglpr_jax.training.callbacks import Callback
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
@@ -28,7 +28,6 @@ from sglpr_jax.training.trainer import METRICS_FILE, Schedule, Trained, Trainer
 from sglpr_jax.training.tuples import split_recordings, tuple_pool
 from sglpr_jax.training.validation import describe_places, training_recall, validation_score
 
-WEIGHTS = "weights"
 LIMITS = ("config.steps",)
 """Settings that may differ when a run is resumed."""
 
@@ -56,7 +55,7 @@ class TrainResult:
         return self.steps == self.config.steps
 
     def __str__(self) -> str:
-        lines = [f"{self.folder}: {self.steps} of {self.config.steps} steps, weights in {self.folder / WEIGHTS}"]
+        lines = [f"{self.folder}: {self.steps} of {self.config.steps} steps, weights in {self.folder / LAST_WEIGHTS}"]
         if self.throughput is not None:
             steps, waiting = self.throughput.steps_per_second, self.throughput.data_wait
             speed = f"{steps:.3g} steps/s, {steps * self.config.tuples:.3g} tuples/s"
@@ -141,7 +140,7 @@ def train(
         state = run_network(config, source, folder, score=score, **options).state
         steps, params, speed = int(state.step), host_copy(state.params), None
         if is_first_host():
-            save(params, folder / WEIGHTS)
+            save(params, folder / LAST_WEIGHTS)
             speed = throughput(read_metrics(folder / METRICS_FILE))
         host_callback.on_end(steps)
     return TrainResult(params, folder, steps, config, speed)

@@ -28,7 +28,7 @@ _CHECKOUT = Path(__file__).resolve().parents[2]
 
 @contextlib.contextmanager
 def lock_run(
-    folder: Path, settings: Mapping[str, Any], *, seed: int, resume: bool, limits: Collection[str] = ()
+    folder: Path, settings: Mapping[str, Any], *, seed: int, resume: bool, limits: Collection[str]
 ) -> Iterator[None]:
     """Lock the folder of a run during the block. First write settings and environment, and remove unfinished files.
 

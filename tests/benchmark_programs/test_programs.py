@@ -14,6 +14,7 @@ import pytest
 
 from sglpr_jax.sim.dataset import simulate
 from sglpr_jax.sim.sensor import Sensor
+from tests.docs.pages import PAGES, blocks, command_lines
 
 ROOT = Path(__file__).resolve().parents[2]
 SENSOR = Sensor(elevations_deg=(2.0, -2.0, -8.0, -16.0), azimuth_steps=90)
@@ -31,7 +32,6 @@ RUN = (
     "speed loops --frames 40 --repeats 1 --azimuth-steps 90 --weights sglpr-small",
     "speed stages --scans 4 --rates 10 --weights sglpr-small",
     "maps moving --seeds 1 --sensors vlp16 --scans 6 --azimuth-steps 90",
-    "robustness hostile --source dds:93 --minutes 0.1 --rate 5 --scans 12 --weights sglpr-small",
     "fleet index --drives drawn.npz --places 2000 --queries 3",
     f"learned data --out learned --only test/town-601 train-images/vlp16-61 {SMALL}",
     f"learned sampler --data learned --part train-images {LIGHT}",
@@ -42,37 +42,12 @@ RUN = (
 """In order: some read what others have written."""
 PARSED = (
     "goldens build/before",
-    "loops images --data images --odometry",
-    "maps cloud --seeds 1",
-    "maps sensors --sensors vlp16",
-    "maps submaps --seeds 1",
-    "poses pairs --drives outskirts:06:622 --carrier handheld --gravity auto --registered",
-    "poses search --scans 60",
-    "realism semantics --weights sglpr --out out --prior towns",
-    "fuzz --hours 0.5 --seed 3",
-    "loops fit drives --out model.json",
-    "robustness disk --commands embed --troubles 'full disk' 'the folder vanishes' --times 1",
-    "robustness kills --commands embed --times 1",
-    "robustness mutations --tree elsewhere",
-    "robustness platforms --extras slam",
-    "robustness together --times 1",
-    "sensors deskew --places 2",
-    "sessions --seeds 1 --odometry drifting",
-    "sensors imu --blind 0.3",
-    "speed embed --scans 65",
-    "speed live --rates 5",
-    "speed start-up --repeats 1 --places 30 --commands embed",
-    "speed trees elsewhere --repeats 1",
-    "torch describe --preset sglpr-small --compiled",
-    "torch step --no-labels",
-    "fleet embed recordings/* --out places",
-    "fleet loops places index found",
-    "fleet places --out drives.npz",
     "learned labels predicted --data learned --out predicted",
-    "learned preset --preset sglpr",
-    "learned train --methods rinet",
+    "speed embed --scans 65",
+    "speed start-up --repeats 1 --places 30 --commands embed",
 )
-"""Programs that run long, whose flags are parsed."""
+"""Programs that run long and that no page shows, whose flags are parsed."""
+START = "python -m benchmarks "
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +70,10 @@ def benchmarks(monkeypatch):
 
 
 def test_every_program_is_tested(benchmarks, capsys):
-    named = {name for line in (*RUN, *PARSED) if (name := benchmarks.program_name(line.split()))}
+    """Those of the pages are parsed with the other blocks of code."""
+    shown = [line for page in PAGES for block in blocks(page) for line in command_lines(block)]
+    shown = [line.removeprefix(START) for line in shown if line.startswith(START)]
+    named = {name for line in (*RUN, *PARSED, *shown) if (name := benchmarks.program_name(line.split()))}
     assert named == set(benchmarks.PROGRAMS)
     benchmarks.main([])
     assert set(benchmarks.PROGRAMS) == {line[:20].strip() for line in capsys.readouterr().out.splitlines()}

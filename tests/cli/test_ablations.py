@@ -1,4 +1,4 @@
-"""Settings of tables 4 to 7 and figure 9 are flags. Each setting trains, and its weights store the setting."""
+"""Settings of tables 4 to 7 and figure 9 are flags. A head that reads labels trains, resumes and embeds."""
 
 import json
 import shutil
@@ -15,7 +15,6 @@ from sglpr_jax.training.config import without_untrained_head
 
 from .conftest import assert_one_line_error, run_command
 
-WITHOUT = "--model.head.cbam False --model.head.pooling mean --model.categories 25 --loss.ce-weight 0 --rotate False"
 TRIPLET = "--loss.ce-weight 0 --loss.dice-weight 0"
 LABELS = "--model.head.input counts+labels --model.categories 15"
 

@@ -113,7 +113,7 @@ def test_rejected_pairs_and_missing_loops_are_explained(command, town, tmp_path,
     assert len(read_g2o(tmp_path / "found" / "loops.g2o").edges) == 1
     lines = command(*run, "--degenerate", "drop").out.splitlines()
     assert lines[0] == "0 loops in 40 of 40 frames of 08, 2 rejected (repeats: 1, degenerate: 1)"
-    assert "2 pairs were compared. For 1 of them: Another place, or another pose, fits about as well." in lines
+    assert "2 pairs were rejected. For 1 of them: Another place, or another pose, fits about as well." in lines
     assert repeats in lines and any(line.startswith("rejected, degenerate (1): The position") for line in lines)
     assert read_g2o(tmp_path / "found" / "loops.g2o").edges == []
     rows = map(json.loads, (tmp_path / "found" / "rejected.jsonl").read_text().splitlines())

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bags import CLOUD, TRANSFORMS, cloud, header, transforms, typestore, write_bag
+from bags import CLOUD, ODOMETRY, TRANSFORMS, cloud, pose, transforms, write_bag
 from drives import drifted, street  # noqa: F401
 
 from sglpr_jax.data.formats.pose_files import read_tum
@@ -33,27 +33,13 @@ def mcap(street, odometry, tmp_path_factory) -> Path:  # noqa: F811
     messages = [("/tf_static", TRANSFORMS, START_S, transforms("mcap", START_S, [BASE]))]
     base_from_lidar = np.eye(4)
     base_from_lidar[:3, 3] = BASE[2]
-    for i, pose in enumerate(odometry @ inverse(base_from_lidar)):
+    bases = odometry @ inverse(base_from_lidar)
+    for i, (base, turned) in enumerate(zip(bases, quaternions(bases), strict=True)):
         time = START_S + STEP_S * i
         messages.append(("/points", CLOUD, time, cloud("mcap", time, street.points(i))))
-        messages.append(("/odom", "nav_msgs/msg/Odometry", time, moved(time, pose)))
+        messages.append(("/odom", ODOMETRY, time, pose("mcap", time, base[:3, 3], turned)))
     folder = write_bag(tmp_path_factory.mktemp("bag") / "drive", "mcap", messages)
     return next(folder.glob("*.mcap")).rename(folder.parent / "drive.mcap")
-
-
-def moved(time, pose):
-    """A message of odometry."""
-    store = typestore("mcap").types
-    at = store["geometry_msgs/msg/Point"](*pose[:3, 3].tolist())
-    turned = store["geometry_msgs/msg/Quaternion"](*quaternions(pose[None])[0].tolist())
-    zero = store["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
-    with_covariance = store["geometry_msgs/msg/PoseWithCovariance"], store["geometry_msgs/msg/TwistWithCovariance"]
-    return store["nav_msgs/msg/Odometry"](
-        header=header("mcap", time, "odom"),
-        child_frame_id="base_link",
-        pose=with_covariance[0](pose=store["geometry_msgs/msg/Pose"](at, turned), covariance=np.zeros(36)),
-        twist=with_covariance[1](twist=store["geometry_msgs/msg/Twist"](zero, zero), covariance=np.zeros(36)),
-    )
 
 
 def test_from_an_mcap_to_a_graph_and_a_corrected_trajectory(command, street, mcap, odometry, tmp_path):  # noqa: F811

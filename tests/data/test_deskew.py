@@ -105,7 +105,7 @@ def test_invalid_arguments_are_one_clear_error():
     zeros = recording_of(times, clouds, within=np.zeros(24, np.float32))
     with pytest.raises(ValueError, match=r"scan 000 of sequence 08: expected times of points over .* found 0 to 0"):
         deskewed(zeros, poses)
-    with pytest.raises(ValueError, match=r"deskewed: expected poses with rotations, found .* at scan 0"):
+    with pytest.raises(ValueError, match=r"08: expected poses \(n, 4, 4\), with rotations, found .* in row 0"):
         deskewed(recording_of(times, clouds), 0 * poses)
     options = {"time": times[0], "pose_times": times, "world_from_lidar": poses}
     for wrong in ({"pose_times": times[::-1]}, {"pose_times": times[:1], "world_from_lidar": poses[:1]}):

@@ -12,9 +12,10 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.data.poses import have_poses, interpolate_poses, poses_of
+from sglpr_jax.data.poses import have_poses, interpolate_poses
 from sglpr_jax.data.readers import open_recording, recording_names, ros
 from sglpr_jax.data.scan_stream import only_readable
+from sglpr_jax.se3 import poses_of
 
 LATE_S = 1000.0
 """The recorder's clock runs so much ahead of the sensors'."""

@@ -107,8 +107,8 @@ def test_labels_stay_with_their_points(tmp_path):
 @pytest.mark.parametrize(
     ("poses", "options", "message"),
     [
-        (np.eye(4)[None], {}, r"08: expected a pose \(4, 4\) for each of 2 scans, found an array of shape \(1, 4, 4\)"),
-        (np.zeros((2, 4, 4)), {}, "expected poses with rotations, found .* at scan 0"),
+        (np.eye(4)[None], {}, "08: expected poses of 2 scans, found poses of 1 scans"),
+        (np.zeros((2, 4, 4)), {}, r"08: expected poses \(n, 4, 4\), with rotations, found .* in row 0"),
         (np.tile(np.eye(4), (2, 1, 1)), {"length_m": -1.0}, "expected length_m in metres, more than 0, found -1.0"),
         (np.tile(np.eye(4), (2, 1, 1)), {"keyframe_m": 0.0}, "expected keyframe_m in metres, more than 0, found 0.0"),
     ],

@@ -36,5 +36,5 @@ def command_lines(block: Block) -> list[str]:
     """The commands of a bash block, one each: loops, chains, comments and continued lines are taken apart."""
     lines = block.text.replace("\\\n", " ").splitlines()
     code = "\n".join(re.split(r"(?:^|\s)#\s", line)[0] for line in lines)
-    commands = (re.sub(r"^do\b", "", command.strip()).strip() for command in re.split(r";|&&|\n", code))
-    return [command for command in commands if command]
+    code = re.sub(r"(^|;)\s*(do\b|taskset -c \d+)", r"\1", code, flags=re.MULTILINE)
+    return [command.strip() for command in re.split(r";|&&|\n", code) if command.strip()]

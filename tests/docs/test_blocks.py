@@ -4,13 +4,12 @@ import dataclasses
 import functools
 import importlib
 import shlex
-import sys
 
 import pytest
 import tyro
 
 import sglpr_jax
-from sglpr_jax.cli.__main__ import load_command, main
+from sglpr_jax.cli.__main__ import load_command
 from sglpr_jax.cli.runtime import parse_command
 from sglpr_jax.models.config import model_preset
 
@@ -18,12 +17,6 @@ from .pages import PAGES, ROOT, blocks, command_lines, name_of
 
 COMMANDS = [(page, line) for page in PAGES for b in blocks(page) if b.language == "bash" for line in command_lines(b)]
 WITH_PYTHON = [page for page in PAGES if any(block.language == "python" for block in blocks(page))]
-QUICK = [
-    "bin/embed --weights sglpr --data my_scans --out mine.npz",
-    "bin/embed --method scan-context --data KITTI --seq 08 --out 08-scan-context.npz",
-    "bin/evaluate 08.npz",
-]
-"""Command lines of the pages that take seconds: these are run."""
 
 
 def lines_of(*, start: str) -> list[str]:
@@ -59,7 +52,7 @@ def test_command_lines_of_benchmarks_are_parsed(line, monkeypatch):
 
 
 def test_nothing_else_is_unknown():
-    known = ("bin/", "python ", "pip install", "for ", "done", "taskset ", "docker ")  # the last: tests/test_docker.py
+    known = ("bin/", "python ", "pip install", "for ", "done", "docker ")  # the last: tests/test_docker.py
     assert not [(name_of(page), line) for page, line in COMMANDS if not line.startswith(known) and "s." not in line]
     assert {block.language for page in PAGES for block in blocks(page)} <= {"bash", "python", "text"}
 
@@ -83,12 +76,3 @@ def test_python_runs(page, in_examples, monkeypatch):
     for block in blocks(page):
         if block.language == "python":
             exec(compile("\n" * block.line + block.text, page, "exec", dont_inherit=True), found)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("line", QUICK)
-def test_quick_commands_run(line, in_examples, own_cache, monkeypatch):
-    assert line in {shown for _, shown in COMMANDS}
-    script, *arguments = shlex.split(line)
-    monkeypatch.setattr(sys, "argv", ["sglpr_jax.cli", script.removeprefix("bin/"), *arguments])
-    main()

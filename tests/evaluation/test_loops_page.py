@@ -38,7 +38,7 @@ def test_the_page_says_if_odometry_loops_or_frames_are_missing(found):
     assert len(Parsed(loops_page(with_session(found, odometry=None))).images) == 2
     none = dataclasses.replace(found, loops=())
     assert loops_page(none).count("No loops.") == 2 and not Parsed(loops_page(none)).images[1:]
-    assert "No pair was compared: according to the" in Parsed(loops_page(none)).texts["Why no loops"]
+    assert "No pair was possible: according to the" in Parsed(loops_page(none)).texts["Why no loops"]
     assert "Why no loops" not in Parsed(loops_page(found)).texts
     page = loops_page(
         with_session(none, frames=0), optimized=OptimizedTrajectory(np.zeros((0, 4, 4)), np.zeros(0, bool))

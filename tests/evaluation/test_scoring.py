@@ -51,6 +51,13 @@ def test_options_replace_the_fields_of_a_file(file, tmp_path):
         assert "last 30 s excluded" in moved.results[0].rule
 
 
+def test_positions_and_times_of_all_scans_fit_a_file_with_skipped_scans(file, tmp_path):
+    kept = ~np.isin(np.arange(800), (3, 700))
+    file.only(kept).save(tmp_path / "town.npz")
+    where = {"positions": file.positions, "times": file.times}
+    assert scores(tmp_path / "town.npz", **where) == scores(tmp_path / "town.npz")
+
+
 def test_options_that_do_not_fit_the_input_are_refused(file):
     pairs = ScoredPairs(np.array([[0, 1], [0, 2]]), np.array([0.5, 0.1]), np.array([True, False]))
     for source, options, message in (

@@ -10,9 +10,10 @@ from recordings import of_scans
 
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
 from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.poses import as_pose, as_poses
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import DataWarning
-from sglpr_jax.loops.arguments import as_pose, as_poses, as_scan, as_seconds
+from sglpr_jax.loops.arguments import as_scan, as_seconds
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Keyframe
@@ -63,7 +64,7 @@ def test_the_functions_ask_so(params):
     recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(2)})
     with pytest.raises(TypeError, match=r"expected odometry \(n, 4, 4\), found the path a\.tum"):
         find_loops(recording, params, odometry="a.tum")
-    with pytest.raises(ValueError, match="08: expected a pose for each of 2 scans, found 1"):
+    with pytest.raises(ValueError, match="08: expected poses of 2 scans, found poses of 1"):
         map_recording(recording, params, POSES[:1])
     with pytest.raises(TypeError, match=r"found the path 0\.bin; read it with sglpr_jax\.read_scan"):
         LoopDetector(params).add("0.bin")

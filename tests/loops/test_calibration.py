@@ -33,7 +33,7 @@ def test_certain_pairs_are_told_apart_and_a_model_fits_them(street, params):
 
 def test_odometry_of_another_length_or_of_a_vehicle_that_stands_still_is_refused(street, params):
     few = only(street, range(5))
-    with pytest.raises(ValueError, match="expected odometry of 5 poses, one for each scan of 08, found 3"):
+    with pytest.raises(ValueError, match="08: expected odometry of 5 scans, found odometry of 3"):
         calibrated(params, few, street.poses.world_from_lidar[:3])
     with pytest.raises(ValueError, match="08: expected frames 2 to 10 m apart"):
         calibrated(params, few, np.tile(np.eye(4), (5, 1, 1)), pairs=2)

@@ -81,7 +81,7 @@ def chosen_by_the_letter(pairs: np.ndarray, starts: int = 20) -> list[int]:
 @given(n=st.integers(0, 60), share=st.sampled_from([0.1, 0.5, 0.9, 1.0]), seed=st.integers(0, 10**6))
 def test_the_set_is_the_one_that_all_degrees_taken_anew_choose(n, share, seed):
     rng = np.random.default_rng(seed)
-    pairs = rng.random((n, n)) < np.sqrt(share)  # some are_consistent one way alone, some not with themselves
+    pairs = rng.random((n, n)) < np.sqrt(share)  # some are consistent one way alone, some not with themselves
     assert largest_consistent_set(pairs).tolist() == chosen_by_the_letter(pairs)
 
 

@@ -27,6 +27,7 @@ from sglpr_jax.loops.probability import AdditiveModel, Curve, LoopModel
 from sglpr_jax.loops.result import LoopSearchResult, Session, diagnose_no_loops
 from sglpr_jax.loops.search import find_loops
 from sglpr_jax.odometry.drift_check import OdometryCheck
+from sglpr_jax.odometry.drift_model import MOTION_DRIFT
 from sglpr_jax.se3 import inverse, transform, yaw_of
 
 N = 40
@@ -136,7 +137,7 @@ def found_in(frames: int, **about) -> LoopSearchResult:
 
 def test_what_is_missing_explains_why_there_are_no_loops():
     (said,) = diagnose_no_loops(found_in(700))
-    assert said.startswith("No pair was compared: according to the images")
+    assert said.startswith("No pair was possible: according to the images")
     assert "according to the odometry" in diagnose_no_loops(found_in(700, odometry=np.tile(np.eye(4), (700, 1, 1))))[0]
     assert "690 of 700 scans are almost empty (fewer than 20" in diagnose_no_loops(found_in(700, empty=690))[0]
     skipped = tuple(map(str, range(400)))
@@ -150,7 +151,7 @@ def test_what_is_missing_explains_why_there_are_no_loops():
         RejectedClosure(LOOP, "repeats"),
     )
     found = dataclasses.replace(found_in(700), rejected=rejected)
-    assert diagnose_no_loops(found) == [f"3 pairs were compared. For 2 of them: {MEANING['repeats']}"]
+    assert diagnose_no_loops(found) == [f"3 pairs were rejected. For 2 of them: {MEANING['repeats']}"]
     assert diagnose_no_loops(dataclasses.replace(found, loops=(LOOP,))) == []
 
 
@@ -165,7 +166,7 @@ def test_degenerate_loops_are_counted_and_can_be_rejected():
 
 
 @pytest.mark.slow
-def test_one_street_on_two_days_has_a_transform_with_and_without_odometry(params):
+def test_one_street_on_two_days_has_a_transform_with_and_without_odometry(params, monkeypatch):
     rows = range(0, 2 * PASS, 2), range(SCANS - 2 * PASS, SCANS, 2)
     both = [part_of_drive(*given) for given in zip(rows, ("first", "second"), strict=True)]
     frames, steps = [one.poses.world_from_lidar[0] for one in both], []
@@ -179,6 +180,12 @@ def test_one_street_on_two_days_has_a_transform_with_and_without_odometry(params
     assert found.within(1).sessions[0].recording is found.sessions[1].recording
     bare = find_loops(both, params, registered=False).between(0, 1)
     assert bare.transforms and not bare.transforms[0].match.is_odometry and len(bare.loops) >= 5
+    drifts, accept_between = [], search.accept_between
+    monkeypatch.setattr(
+        search, "accept_between", lambda *a, drift: drifts.append(drift) or accept_between(*a, drift=drift)
+    )
+    find_loops(both, params, odometry=[None, odometry[1]], registered=False)
+    assert drifts == [MOTION_DRIFT]  # that of the recording that drifts more, not of the second one
 
 
 @pytest.mark.slow
@@ -196,7 +203,7 @@ def test_different_streets_have_no_common_place(params):
     [
         (0, None, "expected recordings with odometry of each, found 0 with"),
         (2, 1, "expected recordings with odometry of each, found 2 with"),
-        (1, 1, "expected odometry of 40 poses, one for each scan of 08, found 3"),
+        (1, 1, "08: expected odometry of 40 scans, found odometry of 3"),
     ],
 )
 def test_other_numbers_of_recordings_odometry_and_poses_are_refused(street, params, recordings, odometry, message):

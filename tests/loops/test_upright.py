@@ -119,9 +119,9 @@ def test_the_covariance_of_a_motion_in_another_frame_is_that_of_drawn_motions():
     motions = np.tile(np.eye(4), (len(drawn), 1, 1))
     motions[:, :3, :3], motions[:, :3, 3] = Rotation.from_rotvec(drawn[:, 3:]).as_matrix(), drawn[:, :3]
     moved = lidar @ motions @ inverse(lidar)
-    keyframe = np.concatenate([moved[:, :3, 3], Rotation.from_matrix(moved[:, :3, :3]).as_rotvec()], axis=1)
+    in_lidar = np.concatenate([moved[:, :3, 3], Rotation.from_matrix(moved[:, :3, :3]).as_rotvec()], axis=1)
     expected = transform_covariance(root @ root.T, lidar)
-    np.testing.assert_allclose(np.cov(keyframe.T), expected, atol=0.05 * expected.diagonal().max())
+    np.testing.assert_allclose(np.cov(in_lidar.T), expected, atol=0.05 * expected.diagonal().max())
 
 
 @pytest.mark.slow

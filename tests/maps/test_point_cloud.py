@@ -121,7 +121,7 @@ def test_tilted_poses_are_told(moving):
 def test_scans_without_a_pose_or_without_points_are_errors(moving):
     with pytest.raises(ValueError, match="expected a list of recordings"):
         point_cloud([moving[0]], [])
-    with pytest.raises(ValueError, match="08: expected 18 poses, found 17"):
+    with pytest.raises(ValueError, match="08: expected poses of 18 scans, found poses of 17"):
         point_cloud([moving[0]], [moving[1][1:]])
     images = of_images({Path("0.png"): np.zeros((128, 128), np.float32)})
     with pytest.raises(ValueError, match="08: expected scans, found ready-made images"):

@@ -26,10 +26,6 @@ def driven(odometry, loops, *, new_world_at: int | None = None) -> IncrementalTr
     return trajectory
 
 
-def last_error(trajectory, true, odometry) -> float:
-    return float(np.linalg.norm((trajectory.map_from_world @ odometry[-1])[:3, 3] - true[-1, :3, 3]))
-
-
 def test_loops_correct_the_last_pose_and_the_path(two_laps, two_laps_odometry, second_lap_loops):
     trajectory = driven(two_laps_odometry, second_lap_loops)
     batch = solve_pose_graph({0: two_laps_odometry}, second_lap_loops).poses

@@ -192,7 +192,7 @@ def test_a_full_disk_is_one_clear_error_and_leaves_only_whole_files(dataset, tmp
 
 
 def test_a_drive_aside_shows_the_same_town_from_another_lane(dataset, drive, tmp_path):
-    aside = open_recording(write(tmp_path / "aside", aside_m=3.0), "08")
+    aside = open_recording(write(tmp_path / "aside", routes=("08",), aside_m=3.0), "08")
     usual = open_recording(dataset, "08")
     assert aside.world == usual.world != ""
     offset = (aside.positions - usual.positions)[:, :2]

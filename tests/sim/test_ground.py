@@ -96,11 +96,11 @@ def test_a_kerb_hides_nothing_and_its_face_is_the_sidewalk():
     towards = np.stack([np.zeros(300), -np.ones(300), down], axis=-1)
     towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
     _, label, _, points = cast(ground, np.array([0, 5.0, 1.73]), towards[None])
-    x_road, x_top, face = points[0, :, 1] > 1e-3, points[0, :, 2] > KERB_M - 1e-3, label[0] == SIDEWALK
-    np.testing.assert_array_equal(face, ~x_road)
-    np.testing.assert_allclose(points[0, x_top, 2], KERB_M, atol=1e-4)
-    np.testing.assert_allclose(points[0, x_road, 2], 0, atol=1e-4)
-    on_face = ~x_road & ~x_top
+    on_road, on_top, face = points[0, :, 1] > 1e-3, points[0, :, 2] > KERB_M - 1e-3, label[0] == SIDEWALK
+    np.testing.assert_array_equal(face, ~on_road)
+    np.testing.assert_allclose(points[0, on_top, 2], KERB_M, atol=1e-4)
+    np.testing.assert_allclose(points[0, on_road, 2], 0, atol=1e-4)
+    on_face = ~on_road & ~on_top
     # A ray into the face is given where it would meet the road behind it: some centimetres too far.
     assert on_face.sum() > 2 and np.all(points[0, on_face, 1] > -0.5)
 

@@ -251,8 +251,8 @@ def parse_pcd(content: Content) -> PointTable:
 
 def posed_scan(path: Path) -> Scan:
     """Read a .pcd file, and move its points from the frame of the sensor by the pose that it states (VIEWPOINT)."""
-    scan, words = table_scan(path, parse=parse_pcd), _viewpoint(path) or ["0", "0", "0", "1", "0", "0", "0"]
-    x, y, z, qw, *vector = parse_numbers(words, columns=7, where="VIEWPOINT")
+    scan, words = table_scan(path, parse=parse_pcd), _viewpoint(path)
+    x, y, z, qw, *vector = parse_numbers(words, columns=7, where="VIEWPOINT") if words else IDENTITY
     (world_from_sensor,) = quaternion_poses(path, np.array([[x, y, z]]), np.array([[*vector, qw]]))
     points = transformed(world_from_sensor, scan.cloud.astype(np.float64))
     return dataclasses.replace(scan, points=points.astype(np.float32))

@@ -22,7 +22,7 @@ LARGEST_SIDE = 1 << 13
 
 
 def read_grey_png(path: Path, *, bits: int) -> UInt[np.ndarray, "h w"]:
-    """Return a greyscale image of 8 or 16 bits per pixel. The first axis is x (right), the second y (up)."""
+    """Return a greyscale image of 8 or 16 bits per pixel, in the orientation of eq. 1: x to the right, y up."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected an image, found none")
     expected = f"{'an 8' if bits == 8 else 'a 16'}-bit grey PNG"
@@ -51,10 +51,10 @@ def image_scan(
 
 
 def read_label_image(path: Path, *, shape: tuple[int, int]) -> Int32[np.ndarray, "h w"]:
-    """Return the SemanticKITTI ids of a 16-bit label image. The first axis is x (right), the second y (up)."""
+    """Return the SemanticKITTI ids of a 16-bit label image, in the orientation of eq. 1: x to the right, y up."""
     ids = read_grey_png(path, bits=16).astype(np.int32)
     if ids.shape != shape:
-        # The file shows x to the right, so the first axis of the array is its columns.
+        # The array is the file rotated by 90 degrees, so its first axis is the columns of the file.
         expected, found = (f"{rows} rows of {columns} pixels" for columns, rows in (shape, ids.shape))
         raise ValueError(f"{path}: expected {expected}, the size of the image, found {found}")
     with naming(path):

@@ -9,11 +9,10 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from sglpr_jax.data.choices import PoseFormat, TimeUnit
-from sglpr_jax.data.poses import poses_of
 from sglpr_jax.data.times import ADVICE, times_of
 from sglpr_jax.fields import check_value
 from sglpr_jax.files import warn
-from sglpr_jax.se3 import ROTATION_TOLERANCE, are_rotations, from_quaternions
+from sglpr_jax.se3 import are_rotations, from_quaternions, have_unit_length, poses_of
 
 CAMERA_FROM_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 """Transform from LiDAR axes (x forward, y left, z up) to camera axes (x right, y down, z forward), same origin."""
@@ -54,9 +53,7 @@ def quaternion_poses(
 ) -> Float[np.ndarray, "n 4 4"]:
     """Return poses from positions in metres and quaternions x, y, z, w. Errors name the invalid row in `path`."""
     check_positions(path, positions)
-    with np.errstate(over="ignore"):  # the square of a damaged number may be infinite
-        lengths = np.linalg.norm(quaternions, axis=1)
-    invalid_rows = np.flatnonzero(~(np.abs(lengths - 1) <= ROTATION_TOLERANCE))
+    invalid_rows = np.flatnonzero(~have_unit_length(quaternions))
     if invalid_rows.size:
         found = " ".join(f"{value:g}" for value in quaternions[invalid_rows[0]])
         row = f"row {invalid_rows[0] + 1}"

@@ -11,15 +11,16 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64, UInt8
+from jaxtyping import Float, Int64, UInt8
 
 from sglpr_jax.data.formats.clouds import check_points, cloud_scan
+from sglpr_jax.data.formats.pose_files import FARTHEST_M
 from sglpr_jax.data.imu import Imu
-from sglpr_jax.data.poses import LEAST_SHARE, have_poses, poses_of
+from sglpr_jax.data.poses import LEAST_SHARE, have_poses
 from sglpr_jax.data.scan import TIME_FIELDS, Scan, time_field_of
 from sglpr_jax.data.times import time_unit_problem
 from sglpr_jax.files import warn
-from sglpr_jax.se3 import from_quaternions
+from sglpr_jax.se3 import from_quaternions, have_unit_length, poses_of
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Numpy types by the number `datatype` of sensor_msgs/PointField."""
@@ -31,10 +32,6 @@ CUSTOM_MSG = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg
 """Message types of Livox scans."""
 LIVOX_FIELDS = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
 """Fields of a point of Livox, and their numpy types."""
-QUATERNION_TOLERANCE = 0.01
-"""Maximum deviation of the length of a quaternion from 1."""
-MOST_POSITION_M = 1e8
-"""Maximum absolute coordinate of a position in metres: more than that of any map projection."""
 IMU = "sensor_msgs/msg/Imu"
 """Message type of an IMU."""
 
@@ -172,8 +169,8 @@ class StampedPose(NamedTuple):
     @property
     def is_valid(self) -> bool:
         """Whether the position is on the Earth, and the quaternion has length 1. Some drivers begin with zeros."""
-        is_on_earth = bool((np.abs(self.numbers[:3]) <= MOST_POSITION_M).all())  # False for NaN
-        return is_on_earth and bool(_have_length_1(self.numbers[None, 3:]).all())
+        is_on_earth = bool((np.abs(self.numbers[:3]) <= FARTHEST_M).all())  # False for NaN
+        return is_on_earth and bool(have_unit_length(self.numbers[None, 3:]).all())
 
 
 def _read_pose(message: RosMessage, *, with_child: bool = True) -> StampedPose:
@@ -247,7 +244,7 @@ class Track:
         pairs = list(messages)
         numbers = np.array([pose.numbers for _, pose in pairs], np.float64).reshape(-1, 7)
         has_position = np.isfinite(numbers[:, :3]).all(axis=1)
-        has_rotation = has_position & _have_length_1(numbers[:, 3:])
+        has_rotation = has_position & have_unit_length(numbers[:, 3:])
         rows = np.flatnonzero(has_rotation if 2 * has_rotation.sum() > has_position.sum() else has_position)
         kept = [pairs[row] for row in rows]
         stamps = Stamps.of((recorder_ns, pose.time) for recorder_ns, pose in kept)
@@ -266,7 +263,7 @@ class Track:
     def poses(self) -> Float[np.ndarray, "n 4 4"]:
         """Poses, with identity rotations if not all quaternions are valid."""
         positions, quaternions = self.numbers[:, :3], self.numbers[:, 3:]
-        return from_quaternions(positions, quaternions) if _have_length_1(quaternions).all() else poses_of(positions)
+        return from_quaternions(positions, quaternions) if have_unit_length(quaternions).all() else poses_of(positions)
 
     @property
     def moves(self) -> bool:
@@ -277,13 +274,8 @@ class Track:
         return f"{len(self)} poses of {self.child or 'a body'} in {self.frame or 'a frame'}"
 
 
-def _have_length_1(quaternions: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:
-    with np.errstate(invalid="ignore", over="ignore"):  # NaN and infinity have another length
-        return np.abs(np.linalg.norm(quaternions, axis=1) - 1) <= QUATERNION_TOLERANCE
-
-
 def _are_changing_rotations(quaternions: Float[np.ndarray, "n 4"]) -> bool:
-    return bool(len(quaternions) and _have_length_1(quaternions).all() and np.ptp(quaternions, axis=0).any())
+    return bool(len(quaternions) and have_unit_length(quaternions).all() and np.ptp(quaternions, axis=0).any())
 
 
 def tracks_of_transforms(transforms: Iterable[tuple[int, StampedPose]]) -> list[Track]:
@@ -307,7 +299,7 @@ def static_transform(tracks: Iterable[Track], frame: str, other: str) -> Float[n
     """Return the transform frame_from_other along static tracks, or None if no static tracks connect the two frames."""
     neighbours: dict[str, list[tuple[str, np.ndarray]]] = defaultdict(list)
     for track in tracks:
-        if len(track) and not track.moves and _have_length_1(track.numbers[:, 3:]).all():
+        if len(track) and not track.moves and have_unit_length(track.numbers[:, 3:]).all():
             frame_from_child = track.poses[0]
             neighbours[track.frame].append((track.child, frame_from_child))
             neighbours[track.child].append((track.frame, np.linalg.inv(frame_from_child)))

@@ -23,7 +23,7 @@ from sglpr_jax.data.formats.scan_files import (
     scan_of_file,
     warn_of_doubts,
 )
-from sglpr_jax.data.poses import poses_at_scans, poses_of
+from sglpr_jax.data.poses import poses_at_scans
 from sglpr_jax.data.readers.listing import describe_contents, files_in, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
@@ -90,7 +90,7 @@ def _read_trajectory(
     trajectory = read_trajectory(
         pose_file, format=options.pose_format, time_unit=options.time_unit, twelve_numbers=twelve_numbers
     )
-    poses, item = poses_of(trajectory.positions), f"scan of {root.resolve().name}"
+    poses, item = trajectory.poses, f"scan of {root.resolve().name}"
     has_pose, poses, how = poses_at_scans(str(pose_file), poses, trajectory.times, times, scans=scans, item=item)
     if times is not None and not has_pose.all():
         uncovered = times[~has_pose]

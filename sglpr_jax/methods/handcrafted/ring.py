@@ -17,7 +17,6 @@ LOWEST_M, HIGHEST_M = -1.0, 10.0
 ANGLES = 60
 """Number of angles, from 0 to 177 degrees. The published angles from 180 degrees on have equal magnitudes again."""
 FREQUENCIES = SIDE // 2 + 1
-NUMBERS = ANGLES * FREQUENCIES
 
 BLOCK = 64
 

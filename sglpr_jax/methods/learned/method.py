@@ -27,7 +27,7 @@ class Tuples(NamedTuple):
 
     descriptors: Float[Array, "t k d"]
     apart_m: Float[Array, "t k"]
-    """Distance of each place from the anchor of its tuple, in metres. Infinite between recordings."""
+    """Distance of each place from the anchor of its tuple, in metres. Infinite between worlds (`Recording.world`)."""
     positives: int
     """Number of positives of each anchor."""
 

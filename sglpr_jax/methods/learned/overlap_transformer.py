@@ -17,6 +17,7 @@ from sglpr_jax.methods.cells import extreme_of_cells, polar
 from sglpr_jax.methods.learned.layers import HE, NetVLAD
 from sglpr_jax.methods.learned.method import LearnedMethod, finite_points, roll_azimuths, triplet
 from sglpr_jax.methods.recipe import Recipe, TupleConfig
+from sglpr_jax.models.convolution import stack_under_kernel
 from sglpr_jax.models.layers import l2_normalize
 
 ROWS, COLUMNS = 64, 900
@@ -60,7 +61,8 @@ class OverlapTransformer(nn.Module):
     def __call__(self, images: Float[Array, "b 64 900"], *, train: bool = False) -> Float[Array, "b 256"]:
         x = images[..., None]
         for height, stride, features in CONVOLUTIONS:
-            x = nn.relu(dense(features, stack_rows(x, height=height, stride=stride)))
+            rows = stack_under_kernel(x, 1, height, stride)  # a linear layer then acts as the convolution
+            x = nn.relu(dense(features, rows))
         columns = nn.relu(dense(CHANNELS, x[:, 0]))
         columns = jnp.concatenate([columns, Transformer()(columns)], axis=-1)
         vlad = NetVLAD(CLUSTERS)(l2_normalize(columns))
@@ -75,12 +77,6 @@ class Transformer(nn.Module):
     def __call__(self, x: Float[Array, "b n c"]) -> Float[Array, "b n c"]:
         x = nn.LayerNorm()(x + nn.MultiHeadDotProductAttention(HEADS)(x))
         return nn.LayerNorm()(x + dense(x.shape[-1], nn.relu(dense(HIDDEN, x))))
-
-
-def stack_rows(x: Float[Array, "b h w c"], *, height: int, stride: int) -> Float[Array, "b _ w {height}*c"]:
-    """Stack the rows that a kernel of one column covers as channels. A linear layer then acts as the convolution."""
-    end = (x.shape[1] - height) // stride * stride + 1
-    return jnp.concatenate([x[:, i : i + end : stride] for i in range(height)], axis=-1)
 
 
 def dense(features: int, x: Float[Array, "*b c"]) -> Float[Array, "*b {features}"]:

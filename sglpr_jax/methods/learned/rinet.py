@@ -28,7 +28,6 @@ ROAD = 1
 """Row of the road, which holds the range of the farthest point. The other rows hold the nearest one."""
 STAGES = ((3, 16), (3, 32), (2, 32), (2, 64), (2, 128))
 """Factor by which the ring is reduced, and number of channels, of each stage after the first one."""
-NUMBERS = 288
 SLOPE = 0.1
 """Slope of the leaky ReLU for negative numbers."""
 SAME_M, HALF_M, WIDTH_M = 3.0, 10.0, 1.5

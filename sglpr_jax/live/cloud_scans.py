@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from sglpr_jax.live.live_map import LiveMap
 
 
-class StoredScans:
+class CloudScans:
     """Stores the scans that a point cloud uses, one file each (000123.npy, by the number of the scan in the map)."""
 
     def __init__(self, folder: Path, live: "LiveMap", *, config: CloudConfig, report: Report):
