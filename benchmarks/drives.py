@@ -9,12 +9,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sglpr_jax.data.formats.pose_files import read_poses
+from sglpr_jax.data.formats.pose_files import read_kitti
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import replacing
-from sglpr_jax.se3 import inverse, poses_of, transform
+from sglpr_jax.se3 import inverse, transform
 from sglpr_jax.sim.drive import CARRIERS
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording, simulate_repeating
 from sglpr_jax.sim.routes import REVISITS
@@ -145,7 +145,7 @@ def in_memory(recording: SimulatedRecording, frames: Sequence[int] | np.ndarray 
     """Renders the scans of `frames`, by default of all, and returns the recording with only these scans, unlabelled."""
     frames = range(len(recording)) if frames is None else frames
     points = {recording.paths[i]: recording.points(int(i)) for i in frames}
-    return dataclasses.replace(recording, read=lambda path, labels, lasers: Scan(points=points[path]))
+    return dataclasses.replace(recording, read=lambda path, labels: Scan(points=points[path]))
 
 
 def on_disk(recording: SimulatedRecording, folder: Path) -> Recording:
@@ -156,7 +156,7 @@ def on_disk(recording: SimulatedRecording, folder: Path) -> Recording:
             for i, scan in enumerate(recording.ids):
                 recording.render(i)[0].astype("<f4").tofile(temporary / f"{scan}.bin")
 
-    def read(path: Path, labels: Path | None, lasers: bool) -> Scan:
+    def read(path: Path, labels: Path | None) -> Scan:
         return Scan(points=np.fromfile(folder / f"{path.name}.bin", "<f4").reshape(-1, 4)[:, :3])
 
     return dataclasses.replace(recording, read=read, label_paths=())
@@ -165,8 +165,8 @@ def on_disk(recording: SimulatedRecording, folder: Path) -> Recording:
 def ready_made(data: Path, name: str) -> tuple[Recording, Float[np.ndarray, "n 4 4"]]:
     """Returns a recording of ready-made images, in the layout NN/imgs/*.png, and its poses from NN/pose.txt."""
     recording = open_recording(data, name)
-    matrices = read_poses(data / name / "pose.txt")[[int(frame) for frame in recording.ids]]
-    return recording, poses_of(matrices[:, :, 3], matrices[:, :, :3])
+    poses = read_kitti(data / name / "pose.txt", camera=False)
+    return recording, poses[[int(frame) for frame in recording.ids]]
 
 
 def recording_of(name: str, scans: Sequence[Scan], times: Float[np.ndarray, " n"] | None = None) -> Recording:
@@ -178,7 +178,7 @@ def recording_of(name: str, scans: Sequence[Scan], times: Float[np.ndarray, " n"
         ids=tuple(map(str, paths)),
         times=times,
         paths=paths,
-        read=lambda path, labels, lasers: scan_of[path],
+        read=lambda path, labels: scan_of[path],
         on_disk=False,
     )
 

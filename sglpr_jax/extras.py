@@ -1,14 +1,25 @@
 """Optional packages (the extras of pyproject.toml): the command that installs them."""
 
+import importlib
 import importlib.metadata
 import re
 import shlex
 import sys
+from types import ModuleType
 
 _REQUIREMENT = re.compile(
     r"(?P<package>[^;]+?)\s*;\s*(?:(?P<platforms>.+)\s+and\s+)?extra\s*==\s*[\"'](?P<extra>[\w-]+)[\"']"
 )
 """Line of a package's metadata: `gtsam>=4.3; extra == 'slam'`, with conditions of the platform before the extra."""
+
+
+def optional_module(name: str, purpose: str, *, extra: str) -> ModuleType:
+    """Import a module of an extra. Raises ImportError, with its purpose and how to install it, if it is missing."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        package = name.partition(".")[0].replace("_", "-")
+        raise ImportError(f"{purpose} needs {package}: {install_command(extra)}") from error
 
 
 def install_command(extra: str) -> str:

@@ -81,7 +81,7 @@ def check_holds_only(folder: Path, names: Collection[str]) -> None:
 
 @contextlib.contextmanager
 def exclusive_lock(folder: Path) -> Iterator[None]:
-    """Create a folder and lock it against other processes of this computer. At the end, remove it if it is empty.
+    """Create a folder and lock it against other processes of this user and computer. At the end, remove it if it is empty.
 
     The lock is a file in the system's temporary folder. It ends with the process.
 
@@ -95,7 +95,8 @@ def exclusive_lock(folder: Path) -> Iterator[None]:
         raise NotADirectoryError(f"{existing}: expected a folder to write into, found a file")
     with raising_write_error(folder, *folder.parents):
         folder.mkdir(parents=True, exist_ok=True)
-    digest = hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:32]
+    user = str(os.getuid()) if hasattr(os, "getuid") else ""  # a lock file of another user cannot be opened
+    digest = hashlib.sha256(os.fsencode(folder.resolve()) + b"\0" + user.encode()).hexdigest()[:32]
     try:
         with filelock.FileLock(Path(tempfile.gettempdir()) / f"sglpr-jax-{digest}.lock", timeout=0):
             try:

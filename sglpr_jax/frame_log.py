@@ -141,7 +141,8 @@ class FrameLog:
                 self.damaged_bytes -= HEAD.size + place.length
                 if number == SETTINGS:
                     self._copies += 1
-                    stored = parse_json(content[place.begin : place.begin + place.length], source=path)
+                    settings = parse_json(content[place.begin : place.begin + place.length], source=path)
+                    stored = settings if isinstance(settings, dict) else None
                 else:
                     self._places[number - 1] = place
             beginning = content[: len(MARK)]

@@ -118,12 +118,6 @@ def travelled(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " n"]:
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def positions_from_camera(world_from_camera: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "n 3"]:
-    """Convert KITTI's camera poses (x right, y down, z forward) to positions (x forward, y left, z up), in metres."""
-    x, y, z = world_from_camera[:, :, 3].astype(np.float64).T
-    return np.stack([z, -x, -y], axis=1)
-
-
 def are_rotations(matrices: Float[np.ndarray, "*b 3 3"]) -> Bool[np.ndarray, "*b"]:
     """Whether each matrix R is a rotation: all entries of R R^T - I are below 0.01, and R is not a reflection."""
     with np.errstate(over="ignore", invalid="ignore"):

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from sglpr_jax.data.formats.png import image_scan
-from sglpr_jax.data.formats.pose_files import read_poses, read_times
+from sglpr_jax.data.formats.pose_files import read_kitti, read_times
 from sglpr_jax.data.formats.scan_files import read_labels
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
-from sglpr_jax.se3 import positions_from_camera
 
 
 def of_scans(clouds: Mapping[Path, np.ndarray], **fields: Any) -> Recording:
@@ -23,8 +22,8 @@ def of_scans(clouds: Mapping[Path, np.ndarray], **fields: Any) -> Recording:
 def of_images(images: Mapping[Path, np.ndarray], **fields: Any) -> Recording:
     """Ready-made images (h, w) by the paths that they are said to have."""
 
-    def read(path: Path, labels: Path | None, lasers: bool) -> Scan:
-        return image_scan(path, labels, lasers, read=images.__getitem__)
+    def read(path: Path, labels: Path | None) -> Scan:
+        return image_scan(path, labels, read=images.__getitem__)
 
     return _recording(tuple(images), read, **{"resolution_m": 0.4, **fields})
 
@@ -32,7 +31,7 @@ def of_images(images: Mapping[Path, np.ndarray], **fields: Any) -> Recording:
 def reading_scans(points_of: Callable[[Path], np.ndarray]) -> Callable[..., Scan]:
     """What reads records of scans whose points a function of the path returns."""
 
-    def read(path: Path, labels: Path | None, lasers: bool) -> Scan:
+    def read(path: Path, labels: Path | None) -> Scan:
         points = points_of(path)
         return Scan(points=points, labels=None if labels is None else read_labels(labels, points=len(points)))
 
@@ -53,4 +52,4 @@ def kitti_trajectory(root: Path, name: str, *, pose_source: str) -> tuple[np.nda
     """Positions (n, 3) of all frames of a sequence in KITTI's layout, their times, and the name of the pose file."""
     file = f"poses/{name}.txt" if pose_source == "kitti" else f"sequences/{name}/poses.txt"
     times = root / "sequences" / name / "times.txt"
-    return positions_from_camera(read_poses(root / file)), read_times(times) if times.is_file() else None, file
+    return read_kitti(root / file)[:, :3, 3], read_times(times) if times.is_file() else None, file

@@ -84,8 +84,8 @@ def _without_ground(recording: SimulatedRecording, share: float) -> Recording:
     paths_without_ground = {path for path in rendered.paths if np.random.default_rng(int(path.name)).random() < share}
     rotations = dict(zip(rendered.paths, recording.poses.world_from_lidar[:, :3, :3], strict=True))
 
-    def read(path: Path, labels: Path | None, lasers: bool) -> Scan:
-        points = rendered.read(path, None, False).points
+    def read(path: Path, labels: Path | None) -> Scan:
+        points = rendered.read(path, None).points
         assert points is not None
         if path in paths_without_ground:
             points = points[points @ rotations[path][2] > 0]  # height above the sensor

@@ -20,7 +20,7 @@ from benchmarks.quality.scoring import OTHER_M
 from sglpr_jax.se3 import inverse, wrap_angle, yaw_of
 from sglpr_jax.sim.drive import PlanarPath, drive_seed, plan_path
 from sglpr_jax.sim.recording import PAUSE_S, drive_through
-from sglpr_jax.sim.routes import travelled
+from sglpr_jax.sim.routes import lengths_along
 from sglpr_jax.sim.sensor import Sensor
 from sglpr_jax.sim.world import build_world
 
@@ -133,7 +133,7 @@ def _plan(seed: int, *, scans: int, spacing_m: float) -> tuple[PlanarPath, Windo
 
 def _spaced_rows(path: PlanarPath, rows: Int[np.ndarray, " n"], spacing_m: float) -> Int[np.ndarray, " k"]:
     """Selects rows of the path that are about `spacing_m` apart."""
-    length_m = travelled(path.xy[rows])
+    length_m = lengths_along(path.xy[rows])
     return rows[np.searchsorted(length_m, np.arange(0, length_m[-1], spacing_m))]
 
 

@@ -23,7 +23,7 @@ from sglpr_jax.training.step import train_step
 
 Preset = Literal["sglpr-small", "sglpr"]
 """The models of which there is a PyTorch counterpart."""
-PAPER_LOSS = LossConfig(margin=0.5, squared=True, reduction="max", temperature=0.0)
+PAPER_LOSS = LossConfig(margin=0.5, squared=True, temperature=0.0)
 """For every preset: one tuple has no use for the losses that read other tuples."""
 CHECKED_STEPS = 2
 

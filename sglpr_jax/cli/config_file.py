@@ -37,7 +37,7 @@ class ConfigFlags:
 
 def flag_values(command: Any) -> dict[str, Any]:
     """Return the values of all flags of a command as JSON values, by flag without the leading dashes."""
-    values = {flag: value for flag, _, value in _all_flags(type(command), vars(command))}
+    values = {flag: value for flag, _, value in all_flags(type(command), vars(command))}
     return json.loads(json.dumps(values, default=str))
 
 
@@ -108,7 +108,7 @@ def _default_of(field: dataclasses.Field) -> Any:
 
 def _split_dotted(arguments: list[str], command: type, fields: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Return the settings with a dot in their names (--candidates.recent-m 50) by name, and the other arguments."""
-    list_flags = {flag for flag, annotation, _ in _all_flags(command, fields) if typing.get_origin(annotation) is tuple}
+    list_flags = {flag for flag, annotation, _ in all_flags(command, fields) if typing.get_origin(annotation) is tuple}
     settings, other_arguments, remaining = {}, [], list(arguments)
     while remaining:
         argument = remaining.pop(0)
@@ -141,7 +141,7 @@ def _replace_settings(
     Raises ValueError if a setting does not exist or a value does not fit it. The message names the setting, after
     `dashes`, the expected and the found value.
     """
-    flags = [flag for flag, _, _ in _all_flags(command, fields)]
+    flags = [flag for flag, _, _ in all_flags(command, fields)]
     unknown = next((flag for flag in settings if flag not in flags), None)
     if unknown is not None:
         similar_flags = difflib.get_close_matches(unknown, flags, n=1)
@@ -166,11 +166,11 @@ def _replace_fields(
     return replaced
 
 
-def _all_flags(config: type, fields: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
+def all_flags(config: type, fields: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
     """Yield flag, annotation and value of all fields of a dataclass and of the configurations in it."""
     for _, flag, annotation, value in _field_flags(config, fields, prefix):
         if is_config(type(value)):
-            yield from _all_flags(type(value), vars(value), flag)
+            yield from all_flags(type(value), vars(value), flag)
         else:
             yield flag, annotation, value
 

@@ -50,7 +50,7 @@ def simulate(root: Path, **options: Any) -> "Simulated":
 
         def on_start(dataset: "Simulated") -> None:
             if dataset.missing:
-                content = "images" if dataset.layout == "images" else "scans"
+                content = "images" if dataset.layout in ("images", "varied") else "scans"
                 size = f"{dataset.scans} {content}, about {dataset.missing_bytes / 1e6:.0f} MB"
                 print(f"simulating {len(dataset.missing)} recordings of {size}", file=sys.stderr)
             bar = progress_bar("simulate", dataset.scans * len(dataset.names))

@@ -1,12 +1,13 @@
 """bin/demo: simulate a drive, find its loops and correct its trajectory, as bin/loops does with any scans."""
 
 import dataclasses
+import shlex
 import sys
 from pathlib import Path
 
 from sglpr_jax.cli.loops import LoopsCommand, check_flags, loops_of_recording
-from sglpr_jax.cli.recording import AUTO, CloudOptions
-from sglpr_jax.cli.runtime import with_installed_names
+from sglpr_jax.cli.recording import AUTO
+from sglpr_jax.cli.runtime import parse_command, with_installed_names
 
 ROUTE = "00"
 DRIVE = {"scenery": "lanes", "sensor": "vlp16", "azimuth_steps": 450, "seed": 0}
@@ -33,14 +34,12 @@ def demo(command: DemoCommand) -> int:
     from sglpr_jax.cli.datasets import simulate  # slow import, not needed for --help
 
     drive, out = command.out / "drive", command.out / "found"
-    output = CloudOptions(cloud=out / "map.ply", grid=out / "map.yaml")
-    loops = LoopsCommand(
-        drive, out=out, odometry=AUTO, optimize=True, output=output, rerun=out / "drive.rrd", open=command.open
-    )
+    files = ("--cloud", out / "map.ply", "--grid", out / "map.yaml", "--rerun", out / "drive.rrd")
+    arguments = [str(word) for word in (drive, "--odometry", AUTO, "--optimize", "--out", out, *files)]
+    loops = dataclasses.replace(parse_command(LoopsCommand, "loops", arguments), open=command.open)
     check_flags(loops)  # an error before the simulation if a package is missing
     simulate(drive, routes=(ROUTE,), scans=command.scans, **DRIVE)
-    outputs = f"--out {out} --cloud {out}/map.ply --grid {out}/map.yaml --rerun {out}/drive.rrd"
-    _print_title(f"bin/loops {drive} --odometry auto --optimize {outputs}")
+    _print_title(shlex.join(["bin/loops", *arguments]))
     status = loops_of_recording(loops)
     if not status:
         _print_title(

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -32,7 +33,7 @@ class LiveCommand(LiveOptions):
 
     The output folder holds the map. A command with the same --out continues it, also after a crash. Ctrl-C or SIGTERM
     ends the command and writes loops.g2o, loops.csv, rejected.jsonl, trajectory.tum and trajectory-optimized.tum. With
-    --cloud or --grid, scans are also stored while the robot drives, in the folder `scans`.
+    --cloud or --grid, scans are also stored while the robot drives, in the folder `cloud-scans`.
 
     Example:
       bin/live dds --topic /points --odometry-topic /odom --sinks dds json:loops.txt --out map
@@ -94,24 +95,24 @@ def run_node(
     Raises ValueError if a setting is invalid or the folder has a map of other settings, and WriteError if the folder
     cannot be written.
     """
-    from sglpr_jax.live.cloud_scans import CloudScans
+    from sglpr_jax.live.cloud_scans import FOLDER, CloudScans
     from sglpr_jax.live.node import Node
     from sglpr_jax.live.result_files import write_results
 
     with exclusive_lock(command.out), contextlib.ExitStack() as exit_stack:
         live_map = _open_map(command, report)
         exit_stack.callback(live_map.close)
-        unpublished, stored = live_map.restore(), None
+        unpublished, cloud_scans = live_map.restore(), None
         if command.output.any:
             config = command.output.cloud_settings
-            stored = CloudScans(command.out / "scans", live_map, config=config, report=report)
+            cloud_scans = CloudScans(command.out / FOLDER, live_map, config=config, report=report)
         sinks = []
         for sink in open_sinks():
             exit_stack.callback(_close_sink, sink, report)
             sinks.append(sink)
         source = open_source(live_map)
         exit_stack.callback(source.close)
-        node = Node(live_map, sinks, report=report, say=say, stored=stored)
+        node = Node(live_map, sinks, report=report, say=say, cloud_scans=cloud_scans)
         node.publish(unpublished)
         say(f"ready: {command.source}, sinks {', '.join(command.sinks)}, map in {command.out}")
         try:
@@ -120,9 +121,10 @@ def run_node(
             say(str(node))
             paths = [*write_results(live_map, command.out), record_command(command, command.out)]
             say(f"{command.out}: {', '.join(path.name for path in paths)}")
-        if stored is not None:
-            recording, poses = stored.recording(command.sensor_height)
-            command.output.write([recording], [poses])
+        if cloud_scans is not None:
+            recording, poses = cloud_scans.recording(command.sensor_height)
+            with contextlib.redirect_stdout(sys.stderr):  # standard output has the lines of the sink `json`
+                command.output.write([recording], [poses])
 
 
 def _check_endpoints(command: LiveCommand) -> None:
@@ -130,7 +132,11 @@ def _check_endpoints(command: LiveCommand) -> None:
     from sglpr_jax.live.result_files import CORRECTED, TRAJECTORY
     from sglpr_jax.live.sources_and_sinks import SINKS, SOURCES, named_module
 
-    named_module(command.source, SOURCES, kind="sources")
+    name, where, _ = named_module(command.source, SOURCES, kind="sources")
+    flags = {"--poses": command.poses, "--odometry-topic": command.odometry_topic}
+    flag = "--poses" if name == "folder" else "--odometry-topic"
+    if unused := [other for other, value in flags.items() if value is not None and other != flag]:
+        raise ValueError(f"{command.source}: expected odometry by {flag}, found {unused[0]}")
     for sink in command.sinks:
         named_module(sink, SINKS, kind="sinks")
     output_files = [(command.out / name).resolve() for name in (TRAJECTORY, CORRECTED)]
@@ -142,9 +148,9 @@ def _check_endpoints(command: LiveCommand) -> None:
     if command.output.any:
         from sglpr_jax.pose_graph.factor_graph import gtsam_library
 
-        command.output.check([], submap_m=0.0)
         if not command.expects_odometry:
             raise ValueError("--cloud and --grid need odometry: expected --odometry-topic or --poses, found neither")
+        command.output.check([Path(where)] if name == "folder" else [], submap_m=0.0)
         gtsam_library()  # an error before the drive if it is missing
 
 

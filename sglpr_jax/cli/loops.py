@@ -22,7 +22,7 @@ from sglpr_jax.cli.recording import (
 from sglpr_jax.cli.runtime import open_page, with_installed_names
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.extras import install_command
-from sglpr_jax.files import exclusive_lock
+from sglpr_jax.files import check_writable, exclusive_lock
 from sglpr_jax.loops.config import Degenerate
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.odometry.config import OdometryConfig, OdometryFormat
@@ -55,7 +55,7 @@ class LoopsCommand:
       bin/loops my_scans --odometry odometry.tum --optimize      corrects your odometry
       bin/loops drive.mcap --odometry drive.mcap --pose-topic /odom --out found
       bin/loops KITTI --seq 08 --odometry KITTI/poses/08.txt --odometry-format kitti
-      bin/loops my_scans --odometry odometry.tum --submap-m 10   a sensor with few points
+      bin/loops my_scans --odometry odometry.tum --submap-m 10   a sensor with a narrow view
       bin/loops monday tuesday --odometry auto --optimize        two drives in one frame
     """
 
@@ -140,6 +140,7 @@ def check_flags(command: LoopsCommand) -> None:
         from sglpr_jax.evaluation import rerun_file  # slow import, not needed without --rerun
 
         rerun_file.check_installed()
+        check_writable(command.rerun)
     if len(recordings) > 1 and (command.source.poses or command.source.times):
         raise ValueError("--poses and --times are those of one recording, found several recordings")
     if command.odometry is None and command.optimize:
@@ -219,7 +220,8 @@ def _search_and_write(command: LoopsCommand) -> int:
     if optimized is not None:
         print(optimized, *describe_errors(result, optimized), sep="\n")
     elif command.optimize:
-        print(f"trajectory not corrected: the odometry of {', '.join(unused)} contradicts the scans and is not used")
+        reason = f"the odometry of {', '.join(unused)} contradicts the scans and is not used"
+        print(f"trajectory not corrected: {reason}{'; no cloud or grid is written' if command.output.any else ''}")
     if not result.whole:  # a signal stopped the search
         _print_files(out / PAGE, paths)
         print("run the same command again to continue", file=sys.stderr)
@@ -244,7 +246,7 @@ def _search_and_write(command: LoopsCommand) -> int:
         viewer = Path(sys.executable).with_name("rerun")
         print(f"{command.rerun}: shown by {viewer} {command.rerun}")
     _print_files(out / PAGE, paths)
-    if next_step := _next_step(command):
+    if (optimized is not None or not command.optimize) and (next_step := _next_step(command)):
         print(with_installed_names(f"next: {next_step}"), file=sys.stderr)
     if command.open:
         open_page(out / PAGE)
@@ -268,4 +270,5 @@ def _next_step(command: LoopsCommand) -> str:
     if others:
         return ""
     trajectory = command.folder / "trajectory-optimized.tum"
-    return f"bin/map {first} --poses {trajectory} makes a map in which bin/relocalize finds scans"
+    seq = f" --seq {command.source.seq}" if command.source.seq else ""
+    return f"bin/map {first}{seq} --poses {trajectory} makes a map in which bin/relocalize finds scans"

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from sglpr_jax.cli.recording import OdometrySubmapOptions, RecordingOptions
 from sglpr_jax.cli.runtime import console
-from sglpr_jax.data.choices import Scale, ScanFormat, SensorHeight
+from sglpr_jax.data.choices import Scale
 from sglpr_jax.fields import CountOrZero
 from sglpr_jax.loops.config import CANDIDATES, MIN_PROBABILITY, PlaceCount
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
@@ -28,6 +28,8 @@ class RelocalizeCommand:
     Other answers follow only if they are more than 20 m (divided by the scale of the map) from every more probable one.
     They share the probability: if several places fit equally well, none of them is probable.
 
+    Without --frame, --sensor-height auto takes the mounting of the map's last place.
+
     Example:
       bin/relocalize my_scans/000003.bin --map town.safetensors
       bin/relocalize my_scans/000003.bin --map town.safetensors --out pose.json
@@ -42,19 +44,13 @@ class RelocalizeCommand:
     """Map of bin/map."""
     frame: CountOrZero | None = None
     """Number of the scan in the recording, from 0."""
-    seq: str | None = None
-    """Sequence of the recording. May be omitted if there is only one."""
     out: Path | None = None
     """JSON file for the answers, the most probable first: place, probability, world_from_query (4 x 4), covariance."""
     candidates: PlaceCount = CANDIDATES
     """Number of the most similar places of the map that the scan is compared with."""
     weights: str = DEFAULT_WEIGHTS
     """Weights that the map was made with."""
-    format: ScanFormat = "auto"
-    """Format of the scan. `auto` detects it from the name or the content of the file."""
-    sensor_height: SensorHeight = "auto"
-    """Height of the sensor above the ground, in metres. `estimate` estimates the height and the tilt from the scan.
-    `auto` takes the mounting of the map's last place or, with --frame, that of the recording."""
+    source: tyro.conf.OmitArgPrefixes[RecordingOptions] = RecordingOptions()
     scale: Scale | None = None
     """Scale that the map must have (--scale of bin/map). By default, the scale of the map is used."""
     submap: tyro.conf.OmitArgPrefixes[OdometrySubmapOptions] = OdometrySubmapOptions()
@@ -70,18 +66,19 @@ def relocalize(command: RelocalizeCommand) -> None:
 
     if command.out is not None:
         check_writable(command.out)
-    if command.frame is None and command.submap.flag:
-        raise ValueError(f"{command.scan}: expected --frame with {command.submap.flag}, found a single scan")
+    unused = command.submap.flag or (command.submap.odometry and "--odometry") or (command.source.seq and "--seq")
+    if command.frame is None and unused:
+        raise ValueError(f"{command.scan}: expected --frame with {unused}, found a single scan")
     params = load(command.weights)
     place_map = PlaceMap.load(command.map, weights_hash=weights_hash(params))
     with naming(command.map):
         check_made_alike({"scale": command.scale or place_map.scale}, {"scale": place_map.scale})
     name = command.scan.name
     if command.frame is None:
-        scan = read_query(command.scan, place_map, format=command.format, sensor_height=command.sensor_height)
+        source = command.source
+        scan = read_query(command.scan, place_map, format=source.format, sensor_height=source.sensor_height)
     else:
-        options = RecordingOptions(command.seq, format=command.format, sensor_height=command.sensor_height)
-        recording = command.submap.open(options, command.scan)
+        recording = command.submap.open(command.source, command.scan)
         scan, name = query_of(recording, command.frame), f"frame {command.frame} of {name}"
     answers = place_map.relocate(params, scan, candidates=command.candidates)
     if not answers:

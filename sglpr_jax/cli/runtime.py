@@ -22,8 +22,8 @@ from typing import Annotated, TypeVar
 import tyro
 from rich.console import Console
 
-from sglpr_jax.cli.config_file import ConfigFlags, flag_values, hide_nested, split_settings
-from sglpr_jax.fields import check_value, field_types, has_bounds
+from sglpr_jax.cli.config_file import ConfigFlags, all_flags, flag_values, hide_nested, split_settings
+from sglpr_jax.fields import check_value, has_bounds
 from sglpr_jax.files import DataWarning, in_short, printable
 
 _TABLE_WIDTH = 140
@@ -96,9 +96,9 @@ def parse_command(command: type[T], name: str, arguments: list[str] | None = Non
         description=with_installed_names(description),
         default=command_line_type(defaults, ConfigFlags()),
     )
-    for field, annotation in field_types(command).items():
+    for flag, annotation, value in all_flags(command, vars(parsed.command)):
         if has_bounds(annotation):
-            check_value(getattr(parsed.command, field), annotation, f"--{field.replace('_', '-')}")
+            check_value(value, annotation, f"--{flag}")
     if parsed.common.dump_config:
         print(json.dumps(flag_values(parsed.command), indent=2))
         sys.exit(0)

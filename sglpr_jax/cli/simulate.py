@@ -26,7 +26,8 @@ class SimulateCommand:
     recordings are called DATASET/NN. --scans is the only other flag."""
     seq: tuple[str, ...] | None = None
     """Routes, from 00 to 10. Their revisits resemble KITTI's: same direction in 00, 02, 05, 06, 07 and 09, opposite
-    direction in 08, no revisits in the others. None: 00 05 08, or no routes with --along."""
+    direction in 08, no revisits in the others. None: 00 05 08, where places repeat 01 06 08, or no routes with
+    --along."""
     along: tuple[Path, ...] = ()
     """KITTI pose files to drive along, each through its own town. Every k-th line is used, for at most --scans
     scans."""

@@ -9,8 +9,8 @@ RecordFormat = Literal["kitti", "nuscenes", "nclt", _Float32, _Float64]
 """Format of a point in a .bin file. `kitti` is `float32x4`. `nuscenes` is `float32x5` with other axes and the laser
 number in the last column."""
 ScanFormat = Literal["auto", "pcd", "pcd-viewpoint", "ply", "npy", "npz", "las", RecordFormat]
-"""Format of a scan file. "auto" takes the format from the file name. "pcd-viewpoint" is pcd with its
-VIEWPOINT applied."""
+"""Format of a scan file. "auto" takes the format from the file name, or from the content of .bin files.
+"pcd-viewpoint" is pcd with its VIEWPOINT applied."""
 PoseFormat = Literal["auto", "kitti", "lidar", "tum", "csv"]
 PoseChoice = Literal["auto", "semantickitti", "kitti"]
 """Pose file to read from KITTI's layout, which may contain two."""

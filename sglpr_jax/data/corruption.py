@@ -160,7 +160,6 @@ class Corruption:
         return f"{self.kind}-{self.strength:g}" if self.strength else self.kind
 
 
-CLEAN = Corruption("clean")
 ROTATION = Corruption("rotation")
 CORRUPTIONS = tuple(Corruption(name, strength) for name, kind in KINDS.items() for strength in kind.strengths)
 """All kinds with their usual strengths."""
@@ -207,12 +206,12 @@ def corrupted(recording: Recording, corruption: Corruption, *, seed: int) -> Rec
             "rotated (rotation)"
         )
 
-    def read(row: int, label_path: Path | None, lasers: bool) -> Scan:
-        scan = recording.read_row(row, label_path, lasers or corruption.kind == "beams")
+    def read(row: int, label_path: Path | None) -> Scan:
+        scan = recording.read_row(row, label_path)
         with naming(scan.name), naming(corruption.name):
             finite = scan.only(np.flatnonzero(np.isfinite(scan.cloud).all(axis=1)))
             rng = np.random.default_rng((seed, row))
             points, remaining = corrupt(finite.cloud, corruption, rng=rng, lasers=finite.lasers)
             return dataclasses.replace(finite.only(remaining), points=points)
 
-    return recording.with_reader(read)
+    return recording.with_reader(read, options={f"corruption {corruption.name}": str(seed)})

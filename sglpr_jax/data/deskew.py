@@ -107,9 +107,9 @@ def deskewed(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"])
             f"sequence {recording.name}: expected times of the points to remove the motion within scans, found none"
         )
 
-    def read(row: int, label_path: Path | None, lasers: bool) -> Scan:
+    def read(row: int, label_path: Path | None) -> Scan:
         """Read and deskew a scan. The result has no times of points."""
-        scan = recording.read_row(row, label_path, lasers)
+        scan = recording.read_row(row, label_path)
         point_times = scan.point_times
         rows = _rows_near(times, row)
         if point_times is None:

@@ -18,7 +18,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import file_name, in_short, raising_write_error, read_json, replacing
 
-FORMAT = "sglpr-jax packed recording 1"
+FORMAT = "sglpr-jax packed recording 2"
 ABOUT_FILE = "pack.json"
 LAYOUT = {"points": ("<f4", [3]), "labels": ("<u2", []), "images": ("<f4", None)}
 """Type and shape of the rows of each array. Images of different packs have different widths."""
@@ -27,16 +27,14 @@ LAYOUT = {"points": ("<f4", [3]), "labels": ("<u2", []), "images": ("<f4", None)
 class Stacked:
     """Arrays in a file that is mapped into memory: array i is rows `offsets[i]` to `offsets[i + 1]`."""
 
-    def __init__(
-        self, path: Path, dtype: str, row: Sequence[int], offsets: Sequence[int], checksums: Sequence[int] | None = None
-    ):
-        """Map a file and its layout as returned by `_write_arrays`. Packs of older versions have no checksums.
+    def __init__(self, path: Path, dtype: str, row: Sequence[int], offsets: Sequence[int], checksums: Sequence[int]):
+        """Map a file and its layout as returned by `_write_arrays`.
 
         Raises ValueError if the layout contradicts the file. Access beyond the end of the file would kill the process.
         """
         if any(type(n) is not int for n in (*offsets, *row)) or sorted(offsets) != [*offsets] or offsets[0] != 0:
             raise ValueError(f"{path.name}: expected offsets in ascending order from 0, found {offsets!s:.60}")
-        if checksums is not None and [type(checksum) for checksum in checksums] != [int] * (len(offsets) - 1):
+        if [type(checksum) for checksum in checksums] != [int] * (len(offsets) - 1):
             raise ValueError(f"{path.name}: expected {len(offsets) - 1} checksums, found {checksums!s:.60}")
         shape = (offsets[-1], *row)
         expected_bytes = np.dtype(dtype).itemsize * math.prod(shape)
@@ -57,7 +55,7 @@ class Stacked:
             start = self._offsets[i] * self._rows.strides[0]
             page_start = start - start % mmap.PAGESIZE
             self._file.madvise(mmap.MADV_WILLNEED, page_start, start + array.nbytes - page_start)
-        if self._checksums is not None and self._checksums[i] != (found := _checksum(array)):
+        if self._checksums[i] != (found := _checksum(array)):
             raise ValueError(
                 f"{self._path}: expected array {i} with the checksum {self._checksums[i]} of pack.json, found {found};"
                 " delete its folder to pack the recording again"
@@ -73,8 +71,8 @@ def _checksum(array: np.ndarray) -> int:
 def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], None] = lambda done: None) -> Recording:
     """Return the same recording, read from its pack in `folder`. If there is no pack, it is created first.
 
-    Points, labels and images are bitwise equal to those of the files, and read-only. Lasers, and the labels of images,
-    still come from the files. `on_progress` is called with the number of packed scans.
+    Points, labels and images are bitwise equal to those of the files, and read-only. Lasers are left out. The labels of
+    images still come from the files. `on_progress` is called with the number of packed scans.
 
     Raises ValueError if the pack is damaged, or if `recording` does not return the content of its files (`on_disk`).
     """
@@ -95,12 +93,11 @@ def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], N
                 _sync(stream)
     arrays = open_pack(target, scans=len(recording))
 
-    def read_row(row: int, label_path: Path | None, lasers: bool) -> Scan:
+    def read_row(row: int, label_path: Path | None) -> Scan:
         if "images" in arrays:
             return image_scan(recording.paths[row], label_path, read=lambda path: arrays["images"][row])
         labels = arrays["labels"][row].astype(np.int32) if label_path is not None and "labels" in arrays else None
-        laser_numbers = recording.read_row(row, None, True).lasers if lasers else None
-        return Scan(points=arrays["points"][row], labels=labels, lasers=laser_numbers)
+        return Scan(points=arrays["points"][row], labels=labels)
 
     return recording.with_reader(read_row)
 

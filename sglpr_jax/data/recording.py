@@ -13,8 +13,8 @@ from jaxtyping import Float, Float32, Int, Int32
 from sglpr_jax.data.mounting import Mounting, upright_from_lidar
 from sglpr_jax.data.scan import Scan
 
-ReadRecord = Callable[[Path, Path | None, bool], Scan]
-"""Reads a scan from the file of its points or image, its label file (None: no labels), and whether to read lasers."""
+ReadScan = Callable[[Path, Path | None], Scan]
+"""Reads a scan from the file of its points or image, and its label file (None: no labels)."""
 ReadUps = Callable[[], tuple[Float[np.ndarray, "n 3"], str] | None]
 """Returns the direction of up in the LiDAR frame at each scan (NaN where unknown) and a description of its source, or
 None if the IMU does not measure gravity."""
@@ -36,7 +36,7 @@ class Recording:
     """Name of each scan, the stem of its file: "000052"."""
     paths: tuple[Path, ...]
     """Files of the scans or images. The scans of a bag have names instead, and the bag is in `containers`."""
-    read: ReadRecord
+    read: ReadScan
     """Function that reads a scan from its files."""
     positions: Float[np.ndarray, "n 3"] | None = None
     """Positions in metres, z up, or None if unknown."""
@@ -121,16 +121,14 @@ class Recording:
         options = getattr(self.read, "keywords", {})
         return {name: value for name, value in options.items() if isinstance(value, str)}
 
-    def scan(self, i: int, *, labels: bool = True, lasers: bool = False) -> Scan:
-        """Read scan or image `i`, each of its files once, with or without labels and laser numbers."""
-        return self.read_row(i, self.label_paths[i] if labels and self.label_paths else None, lasers)
+    def scan(self, i: int, *, labels: bool = True) -> Scan:
+        """Read scan or image `i`, each of its files once, with or without labels."""
+        return self.read_row(i, self.label_paths[i] if labels and self.label_paths else None)
 
-    def read_row(self, i: int, label_path: Path | None, lasers: bool) -> Scan:
+    def read_row(self, i: int, label_path: Path | None) -> Scan:
         """Read scan or image `i` with the labels of a file, or without labels, and add what is known of it."""
-        scan = self.read(self.paths[i], label_path, lasers)
         return dataclasses.replace(
-            scan,
-            lasers=scan.lasers if lasers else None,
+            self.read(self.paths[i], label_path),
             name=f"scan {self.ids[i]} of sequence {self.name}",
             time=None if self.times is None else float(self.times[i]),
             mounting=self.mounting_of(i),
@@ -142,7 +140,7 @@ class Recording:
 
     def with_reader(
         self,
-        read_row: Callable[[int, Path | None, bool], Scan],
+        read_row: Callable[[int, Path | None], Scan],
         *,
         options: Mapping[str, str] | None = None,
         **fields: Any,
@@ -150,14 +148,14 @@ class Recording:
         """Return a recording whose scans are computed from those of this recording, such as corrupted or scaled ones.
 
         Arguments:
-          read_row: Function of the row, the label file and whether to read lasers, as `Recording.read_row`.
+          read_row: Function of the row and the label file, as `Recording.read_row`.
           options: Read options that identify the change, in addition to those of this recording.
           fields: Other fields that change.
         """
         row_of = {path: row for row, path in enumerate(self.paths)}
 
-        def read(path: Path, label_path: Path | None, lasers: bool, **options: str) -> Scan:
-            return read_row(row_of[path], label_path, lasers)
+        def read(path: Path, label_path: Path | None, **options: str) -> Scan:
+            return read_row(row_of[path], label_path)
 
         read_options = {**self.read_options, **(options or {})}  # the keywords of the partial, unused by `read`
         return dataclasses.replace(self, read=partial(read, **read_options), on_disk=False, **fields)

@@ -36,7 +36,7 @@ def scaled(recording: Recording, scale: Scale) -> Recording:
     recording.require_scans(f"scans to scale by {scale}")
     mountings = recording.mountings
     return recording.with_reader(
-        lambda row, label_path, lasers: scaled_scan(recording.read_row(row, label_path, lasers), scale),
+        lambda row, label_path: scaled_scan(recording.read_row(row, label_path), scale),
         options={SCALE: str(scale)},
         mounting=_scaled_mounting(recording.mounting, scale),
         mountings=None if mountings is None else tuple(_scaled_mounting(mounting, scale) for mounting in mountings),

@@ -20,6 +20,8 @@ FARTHEST_M = 300.0
 """Limit of the largest coordinate of a point, in metres. No vehicle LiDAR has half of its points beyond it."""
 TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "time_stamp", "stamps", "offset_time", "ts", "gps_time")
 """Names of the field that drivers use for the time of a point."""
+LASER_FIELDS = ("ring", "channel", "line", "laser_id", "laser")
+"""Names of the field that drivers use for the laser number of a point."""
 UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
 """Possible units of the times of points, in seconds."""
 SHORTEST_S, LONGEST_S = 0.002, 1.0
@@ -60,6 +62,11 @@ def check_cloud(points: Float32[np.ndarray, "n _"], *, name: str = "") -> None:
 def time_field_of(names: Collection[str]) -> str | None:
     """Return the first of `TIME_FIELDS` among the names of the fields of a point, or None."""
     return next((name for name in TIME_FIELDS if name in names), None)
+
+
+def laser_field_of(names: Collection[str]) -> str | None:
+    """Return the first of `LASER_FIELDS` among the names of the fields of a point, or None."""
+    return next((name for name in LASER_FIELDS if name in names), None)
 
 
 class TimeField(NamedTuple):

@@ -115,7 +115,7 @@ def submaps(
             scan = dataclasses.replace(scan, labels=np.zeros(len(scan.cloud), np.int32))
         return _one_point_per_voxel(scan)
 
-    def read_submap(row: int, label_path: Path | None, lasers: bool) -> Scan:
+    def read_submap(row: int, label_path: Path | None) -> Scan:
         newest, *older = rows_of_submap[row]
         scans = {newest: read_thinned(newest, label_path is not None)}
         for keyframe in older:

@@ -26,14 +26,14 @@ PICTURE = "segmentation.png"
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class SegmentationScore(PrintsItself):
-    """IoU of each class over all cells with points and a label. Prints itself as a table."""
+    """IoU of each class over all cells with a label and a predicted class. Prints itself as a table."""
 
     iou: Float[np.ndarray, " k"]
     """Intersection over union of each class, NaN for a class without cells."""
     shares: Float[np.ndarray, " k"]
     """Fraction of the cells that belong to each class."""
     cells: int
-    """Number of cells with points and a label."""
+    """Number of cells with a label and a predicted class."""
     categories: int = 20
     """Number of categories in the taxonomy of the classes (`labels.taxonomy`)."""
     title: str = ""
@@ -77,7 +77,7 @@ class SegmentationScore(PrintsItself):
         rows = [(name, f"{share:.2%}", f"{iou:.3f}") for name, share, iou in classes if share]
         rows.append((f"mean of {self.n_present} classes", "", f"{self.mean_iou:.3f}"))
         rows.append((f"{self.majority} everywhere", "", f"{self.majority_mean_iou:.3f}"))
-        return TextTable(header, rows, header[1:], self.title, f"{self.cells} cells with points and a label")
+        return TextTable(header, rows, header[1:], self.title, f"{self.cells} cells with a label and a predicted class")
 
 
 def segment_recording(
@@ -92,7 +92,7 @@ def segment_recording(
     """Predict semantic maps of a recording, score them, and draw the middle labelled scan into `folder` (figure 7).
 
     `on_map` is called with row, scan and map of every scan. Without it, only labelled scans are predicted. Returns None
-    without labels. Raises ValueError if there are labels, but no cell has both points and a label.
+    without labels. Raises ValueError if there are labels, but no labelled cell has a predicted class.
     """
     config = params.config
     labelled_rows = np.flatnonzero(recording.labelled).tolist()
@@ -154,7 +154,7 @@ def score_confusion(confusion: Int[np.ndarray, "k k"], *, categories: int = 20, 
     cells_of_class = confusion.sum(1)
     cells = int(cells_of_class.sum())
     if not cells:
-        raise ValueError("expected cells with points and labels, found none")
+        raise ValueError("expected cells with labels and predicted classes, found none")
     union = cells_of_class + confusion.sum(0) - np.diag(confusion)
     iou = np.where(cells_of_class > 0, np.diag(confusion) / np.maximum(union, 1), np.nan)
     return SegmentationScore(iou, cells_of_class / cells, cells, categories, title)

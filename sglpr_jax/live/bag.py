@@ -78,7 +78,7 @@ def open_source(where: str, options: LiveOptions, report: Report, is_in_map: IsI
     """Open the bag `where`.
 
     Raises:
-      FileNotFoundError: If there is no bag, or none of its topics is `options.topic`.
+      FileNotFoundError: If there is no bag, or if it has several topics and none of them is `options.topic`.
       ValueError: If the bag is broken, or `options.odometry_topic` has no poses with rotations.
       ImportError: If the extra `ros` is not installed.
     """

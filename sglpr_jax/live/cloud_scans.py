@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from sglpr_jax.live.live_map import LiveMap
 
 
+FOLDER = "cloud-scans"
+"""Folder of the scans in that of the map."""
+
+
 class CloudScans:
     """Stores the scans that a point cloud uses, one file each (000123.npy, by the number of the scan in the map)."""
 
@@ -27,14 +31,16 @@ class CloudScans:
         """Continue the folder of a restored map. `config` has the distance of the scans and the size of voxels."""
         self._folder, self._live, self._config, self._report = folder, live, config, report
         self._is_full = False
+        for path in folder.glob("[0-9]*.npy"):
+            if int(path.stem) >= len(live.odometry):  # the map lost this scan, and will give its number again
+                path.unlink()
         numbers = self._numbers()
         self._last_m: Float[np.ndarray, " 3"] | None = live.odometry[numbers[-1], :3, 3] if numbers else None
         """Position of the last stored scan."""
 
     def _numbers(self) -> list[int]:
-        """Return the numbers of the stored scans that the map has. A crash may leave one that it does not have."""
-        numbers = sorted(int(path.stem) for path in self._folder.glob("[0-9]*.npy"))
-        return [number for number in numbers if number < len(self._live.odometry)]
+        """Return the numbers of the stored scans."""
+        return sorted(int(path.stem) for path in self._folder.glob("[0-9]*.npy"))
 
     def add(self, scan: Scan) -> None:
         """Store the last scan of the map, unless it is near the last stored one. A full disk is reported."""

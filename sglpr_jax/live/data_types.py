@@ -51,7 +51,7 @@ class FrameStatus(NamedTuple):
     places: int
     """Number of stored scans."""
     nbytes: int
-    """Memory of the stored scans, in bytes."""
+    """Memory of the map, in bytes (`LiveMap.nbytes`)."""
     map_from_world: Float[np.ndarray, "4 4"] | None = None
     """Transform from the odometry's frame to the map, by all loops so far. None without odometry or gtsam, and after a
     restart until a loop connects the odometry with that before."""

@@ -13,7 +13,7 @@ from sglpr_jax.data.choices import PoseFormat, RecordFormat, TimeUnit
 from sglpr_jax.data.formats.bin_records import detect_format_unless_kitti
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, parse_numbers, quaternion_poses
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, format_by_name, scan_of_file
-from sglpr_jax.data.poses import BEYOND_S, pose_at
+from sglpr_jax.data.poses import BEYOND_S, SAME_S, pose_at
 from sglpr_jax.data.readers.listing import files_in
 from sglpr_jax.data.times import EPOCH, PER_SECOND
 from sglpr_jax.files import in_short
@@ -112,21 +112,24 @@ class FolderSource:
             stamp, written = _time_in_name(path), path.stat().st_mtime
         except Exception as error:  # whatever a file holds, the source lives on
             return self._report("scan", f"a scan is left out: {in_short(error, most=300)}")
-        pose = None
+        pose, is_late = None, False
         row = len(self._taken) - 1  # of the scan, and of its line in a file of poses without times
-        if self._poses is not None:
-            deadline = written + MAX_POSE_WAIT_S
-            while (pose := self._pose_or_none(self._poses, row, stamp)) is None and time.time() < deadline:
+        while self._poses is not None and pose is None and not is_late:
+            is_late = time.time() >= written + MAX_POSE_WAIT_S
+            pose = self._pose_or_none(self._poses, row, stamp, is_late=is_late)
+            if pose is None and not is_late:
                 time.sleep(POLL_S)
                 yield None
         scan = dataclasses.replace(scan, name=_scan_name(path))
         yield LiveFrame(scan, time=written if stamp is None else stamp, odometry=pose, received=received)
 
-    def _pose_or_none(self, poses: "GrowingPoses", row: int, stamp: float | None) -> Float[np.ndarray, "4 4"] | None:
+    def _pose_or_none(
+        self, poses: "GrowingPoses", row: int, stamp: float | None, *, is_late: bool
+    ) -> Float[np.ndarray, "4 4"] | None:
         """Pose of a scan, or None if the file does not have it yet. An invalid line is reported."""
         try:
             poses.read_appended()
-            return poses.of(row, stamp)
+            return poses.of(row, stamp, is_late=is_late)
         except (ValueError, OSError) as error:
             return self._report("poses", f"a pose is left out: {in_short(error, most=300)}")
 
@@ -177,15 +180,17 @@ class GrowingPoses:
         if first_error is not None:
             raise first_error
 
-    def of(self, row: int, time: float | None) -> Float[np.ndarray, "4 4"] | None:
+    def of(self, row: int, time: float | None, *, is_late: bool = False) -> Float[np.ndarray, "4 4"] | None:
         """Return the pose of a scan, or None if the file does not have it yet. Scans and files with times are matched
-        by `time`, in seconds, with interpolation. Others are matched by `row`, the number of the scan."""
+        by `time`, in seconds, with interpolation. A pose at or after it is awaited, unless the scan `is_late`. Others
+        are matched by `row`, the number of the scan."""
         if time is None or self._format not in ("auto", "tum"):
             return self._poses[row] if row < len(self._poses) else None
         first_later = bisect.bisect_left(self._times, time)
         near_lines = range(max(first_later - NEAR_POSES, 0), min(first_later + NEAR_POSES, len(self._poses)))
         valid = [(self._times[i], pose) for i in near_lines if (pose := self._poses[i]) is not None]
-        if len(valid) < 2 or valid[-1][0] < time - BEYOND_S:  # the file does not reach the time yet
+        needed = time - (BEYOND_S if is_late else SAME_S)
+        if len(valid) < 2 or valid[-1][0] < needed:  # the file does not reach the time yet
             return None
         stamps, poses = zip(*valid, strict=True)
         return pose_at(np.array(stamps), np.stack(poses), time)

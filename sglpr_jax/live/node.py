@@ -36,11 +36,11 @@ class Node:
         *,
         report: Report,
         say: Callable[[str], object],
-        stored: CloudScans | None = None,
+        cloud_scans: CloudScans | None = None,
     ):
         """Connect a map to sinks and, if points are kept, to their folder. `say` prints lines about the progress."""
         self._live, self._sinks, self._report, self._say = live, list(sinks), report, say
-        self._stored = stored
+        self._cloud_scans = cloud_scans
         self._scan_seconds: deque[float] = deque(maxlen=TIMED_SCANS)
         """Times for processing the latest scans, in seconds."""
         self.scans = self.left_out = self.dropped = self.loops = 0
@@ -100,8 +100,8 @@ class Node:
             map_from_world=self._live.map_from_world,
         )
         self._send_to_sinks("frame", status)
-        if self._stored is not None:  # after the loops are published, because it writes to the disk
-            self._stored.add(frame.scan)
+        if self._cloud_scans is not None:  # after the loops are published, because it writes to the disk
+            self._cloud_scans.add(frame.scan)
 
     def _send_to_sinks(self, method: Literal["frame", "loop"], message: FrameStatus | LoopEdge) -> None:
         """Call `method` of every sink with a message. A sink that fails is reported and not used again."""

@@ -24,7 +24,7 @@ RESET_M = 0.2
 HOLD_S = 2.0
 """Maximum time without odometry, in seconds, for which scans that show no motion are left out. The first such scan is
 always left out."""
-WAIT_S = 10.0
+FIRST_ODOMETRY_S = 10.0
 """Time for which the first scans wait for odometry that was asked for, in seconds."""
 
 
@@ -92,12 +92,14 @@ class OdometryContinuity:
     def _awaits_odometry(self, pose: Float[np.ndarray, "4 4"] | None, time: float) -> bool:
         """Return whether the first scans still wait for odometry. If not, `has_odometry` is set by this scan."""
         self._began = time if self._began is None else self._began
-        if pose is None and self._expected and time - self._began < WAIT_S:
+        if pose is None and self._expected and time - self._began < FIRST_ODOMETRY_S:
             self._report("wait", "expected odometry, found none yet; scans are left out until it comes")
             return True
         self.has_odometry = pose is not None
         if self._expected and not self.has_odometry:
-            self._report("wait over", f"expected odometry, found none for {WAIT_S:.0f} s; the map is made without it")
+            self._report(
+                "wait over", f"expected odometry, found none for {FIRST_ODOMETRY_S:.0f} s; the map is made without it"
+            )
         return False
 
     def _is_plausible(self, pose: Float[np.ndarray, "4 4"], time: float, resumed: bool) -> bool:

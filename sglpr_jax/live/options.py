@@ -14,7 +14,7 @@ class LiveOptions:
     """Options of all sources and sinks. Each uses those that apply to it."""
 
     topic: str | None = None
-    """Topic of the point clouds. By default the only one (bag) or /points."""
+    """Topic of the point clouds, by default /points. The single topic of a bag is always used."""
     odometry_topic: str | None = None
     """Topic of the odometry. Without odometry, loops are found by the scans alone."""
     reliable: bool = False

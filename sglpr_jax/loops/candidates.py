@@ -350,8 +350,7 @@ class CandidateSearch:
             links.append(self._from_reference(expected, reference.frame))
         if len(links) == 2 and not any(map(self.motion.is_ridge, links)):
             first, second = links
-            apart_m, angle = np.hypot(first.x - second.x, first.y - second.y), first.angle_to(float(second.yaw))
-            if apart_m <= AGREE_M and angle <= np.radians(AGREE_DEG):
+            if agree(first.match_from_query, second.match_from_query):
                 return first
         return along_ridge
 

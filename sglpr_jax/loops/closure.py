@@ -211,7 +211,7 @@ MEANING: dict[Reason, str] = {
     "repeats": "Another place, or another pose, fits about as well.",
     "too few neighbours": "Too few of the frames before and after the query show the same place.",
     "contradicts the motion": "The motion between the two frames, estimated from their images, leads elsewhere.",
-    "contradicts the odometry": "The loop needs more drift of the odometry than was stated.",
+    "contradicts the odometry": "The loop needs more drift of the odometry than was stated and than the images show.",
     "contradicts other loops": "The loop is not consistent with the largest set of loops that agree.",
     "little overlap": "The two scans, registered in 6 degrees of freedom, overlap too little.",
     "degenerate": f"The position is uncertain by more than {DEGENERATE_M:g} m along one direction, as between walls.",

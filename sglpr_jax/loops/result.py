@@ -197,5 +197,5 @@ def diagnose_no_loops(result: LoopSearchResult) -> list[str]:
     return [
         *reasons,
         f"No pair was possible: according to the {source}, no scan came back to a place after at least "
-        f"{result.config.candidates.recent_m:g} m of travelled distance.",
+        f"{result.config.candidates.recent_m / result.scale:g} m of travelled distance.",
     ]

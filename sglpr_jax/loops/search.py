@@ -313,7 +313,7 @@ def _search_pair(
     knows_height = match_finder.knows_height and query_finder.knows_height
     model, config = sessions[0].detector.model, sessions[0].detector.config
     drifts = match_finder.present_drift, query_finder.present_drift
-    drift = max(drifts, key=lambda drift: drift.degrees_per_metre)  # that of the recording that drifts more
+    drift = DriftModel(*map(max, *map(dataclasses.astuple, drifts)))  # the larger one of each number
     options = {"should_stop": should_stop, "on_progress": on_progress}
     candidates = _candidates_between(match_finder, query_finder, motion, drift, **options)
     pairs = [pair_of(candidate, model, motion, mountings, knows_height=knows_height) for candidate in candidates]
@@ -391,13 +391,14 @@ def _align_segments(
     frames_of_scans = {}  # frame of each scan, by session
     for node, searched in zip(loops[0].nodes, sessions, strict=True):
         finder, odometry = searched.detector.finder, searched.odometry
-        frames_of_scans[node.session] = np.searchsorted(finder.rows, np.arange(finder.scans))
-        frames = np.flatnonzero(finder.motion.segments == finder.segments_of(np.array([node.frame])))
-        first, last = finder.rows[frames[[0, -1]]].tolist()
+        scans = np.arange(finder.scans)
+        frames, segment_of_scan = np.searchsorted(finder.rows, scans), finder.segments_of(scans)
+        frames_of_scans[node.session] = frames
+        first, last = np.flatnonzero(segment_of_scan == segment_of_scan[node.frame])[[0, -1]].tolist()
         segments.append(TrajectorySegment(node.session, first, last, odometry is not None))
         if odometry is None:
             lidar_poses = finder.motion.poses @ searched.recording.uprights[finder.rows]
-            poses.append(inverse(lidar_poses[frames[0]]) @ lidar_poses)
+            poses.append(inverse(lidar_poses[frames[first]]) @ lidar_poses)
         else:
             poses.append(odometry[finder.rows])
     match_poses, query_poses = poses

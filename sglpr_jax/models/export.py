@@ -15,7 +15,7 @@ import numpy as np
 
 from sglpr_jax.data.density_image import CEILING_M, EDGE_STEP_M, FIRST_EDGE_M, FLOOR_M, MAX_VOXELS, REACH_M
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M
-from sglpr_jax.extras import install_command
+from sglpr_jax.extras import install_command, optional_module
 from sglpr_jax.fields import check_value
 from sglpr_jax.files import check_holds_only, json_text, replacing
 from sglpr_jax.grid import DENSITY_MAX_COUNT, DENSITY_RESOLUTION_M, Grid
@@ -67,10 +67,7 @@ def save_program(params: Params, folder: Path | str, *, format: ProgramFormat) -
 
 def stablehlo(params: Params) -> bytes:
     """Return `describe` with these weights, serialised by `jax.export`. Raises ImportError without flatbuffers."""
-    try:
-        import flatbuffers  # noqa: F401
-    except ImportError as error:
-        raise ImportError(f"StableHLO requires the package flatbuffers: {install_command('export')}") from error
+    optional_module("flatbuffers", "StableHLO", extra="export")
     grid = params.config.grid
     shape = jax.export.symbolic_shape(f"b, {grid.height}, {grid.width}")
     program = jax.jit(lambda bev: describe(params, bev))

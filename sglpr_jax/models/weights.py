@@ -1,8 +1,7 @@
 """Parameters of a model: names, parts, partial restore, checksums, averages, and the fit of the whitening layer."""
 
 import dataclasses
-import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import flax.struct
@@ -12,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from sglpr_jax.data.formats.tensors import hash_of
 from sglpr_jax.models.config import WHITENING_POWER, ModelConfig
 
 SEGMENTATION_LAYERS = ("segmentation_head", "narrow", "detail")
@@ -97,15 +97,6 @@ def weights_hash(params: Params) -> str:
 def own_hash(params: Params) -> str:
     """Return the SHA-256 of the weights that `describe` uses."""
     return hash_of(by_name(descriptor_layers(params)))
-
-
-def hash_of(named: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of names, shapes, types and values of arrays, in the order of their names."""
-    digest = hashlib.sha256()
-    for name, array in sorted(named.items()):
-        digest.update(f"{name} {array.shape} {array.dtype}".encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
 
 
 def average(models: Sequence[Params], *, shares: Sequence[float] | None = None) -> Params:

@@ -11,12 +11,12 @@ import jax
 import numpy as np
 import safetensors
 
-from sglpr_jax.data.formats.tensors import tensors_as_bytes
+from sglpr_jax.data.formats.tensors import hash_of, tensors_as_bytes
 from sglpr_jax.files import check_holds_only, in_short, json_text, read_json, replacing
 from sglpr_jax.models.config import config_from_dict
 from sglpr_jax.models.sglpr import weight_shapes
 from sglpr_jax.models.shipped import weights_folder
-from sglpr_jax.models.weights import Params, as_tree, by_name, hash_of
+from sglpr_jax.models.weights import Params, as_tree, by_name
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"

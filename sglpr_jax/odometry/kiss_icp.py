@@ -19,7 +19,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled, scaled_poses
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable, scan_stream
-from sglpr_jax.extras import install_command
+from sglpr_jax.extras import optional_module
 from sglpr_jax.files import warn
 from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.odometry.config import OdometryConfig
@@ -250,8 +250,4 @@ def check_installed() -> None:
 
 
 def _library() -> ModuleType:
-    """Import kiss-icp. Raises ImportError, which says how to install it, if it is missing."""
-    try:
-        return importlib.import_module("kiss_icp.kiss_icp")
-    except ImportError as error:
-        raise ImportError(f"odometry from scans needs kiss-icp: {install_command('odometry')}") from error
+    return optional_module("kiss_icp.kiss_icp", "odometry from scans", extra="odometry")

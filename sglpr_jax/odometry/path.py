@@ -125,7 +125,7 @@ class DrivenPath:
     def position_deviations(
         self, rows: Int[np.ndarray, " k"], frame: int, *, drift: DriftModel = DriftModel()
     ) -> Float[np.ndarray, " k"]:
-        """Root of the trace of the position covariance of each of `rows` (frames) relative to a frame, in metres."""
+        """Root of the trace of the position covariance of a frame relative to each of `rows` (frames), in metres."""
         position = self.poses[frame, :3, 3] - self.poses[0, :3, 3]
         sums = self._sums.rows[rows] - self._sums.rows[frame]
         # Weights of the integral of |p - position|^2 = |position|^2 - 2 p position + |p|^2 over positions p.

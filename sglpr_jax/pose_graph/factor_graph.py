@@ -1,13 +1,12 @@
 """Factor graph of gtsam (extra `gtsam`) with the noise of odometry and loops."""
 
-import importlib
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.extras import install_command
+from sglpr_jax.extras import optional_module
 
 FIRST_POSE = 1e-6
 """Standard deviation of the first pose, which stays fixed, in metres and radians."""
@@ -15,10 +14,7 @@ FIRST_POSE = 1e-6
 
 def gtsam_library() -> ModuleType:
     """Import gtsam. Raises ImportError if the extra `gtsam` is not installed."""
-    try:
-        return importlib.import_module("gtsam")
-    except ImportError as error:
-        raise ImportError(f"optimisation of a trajectory needs gtsam: {install_command('gtsam')}") from error
+    return optional_module("gtsam", "optimisation of a trajectory", extra="gtsam")
 
 
 class FactorGraph:

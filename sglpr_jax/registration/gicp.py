@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from sglpr_jax.extras import install_command
+from sglpr_jax.extras import optional_module
 from sglpr_jax.se3 import transformed
 
 COARSE_VOXEL_M, VOXEL_M = 1.0, 0.25
@@ -225,8 +225,4 @@ def check_installed() -> None:
 
 
 def _library(name: str) -> ModuleType:
-    """Import an optional library. Raises ImportError, which says how to install it, if it is missing."""
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise ImportError(f"registration of scans needs {name.replace('_', '-')}: {install_command('slam')}") from error
+    return optional_module(name, "registration of scans", extra="slam")

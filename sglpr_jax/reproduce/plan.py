@@ -11,7 +11,7 @@ from sglpr_jax.data.readers import recording_names
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.methods.method import LABELLED, Takes
 from sglpr_jax.methods.registry import handcrafted, method_with_weights
-from sglpr_jax.reproduce.experiments import EXPERIMENTS
+from sglpr_jax.reproduce.experiments import EXPERIMENTS, FULL
 from sglpr_jax.reproduce.reproduction import Reproduction, content_of
 from sglpr_jax.revisits import revisits
 from sglpr_jax.training.batch_source import training_batches
@@ -52,6 +52,11 @@ def check_inputs(reproduction: Reproduction, names: Sequence[str], nclt: Path | 
     for name in reproduction.weights:
         method_with_weights(name)  # raises an error if the weights are missing or damaged
     for name, experiment in experiments.items():
+        if experiment.needs_labels and not reproduction.config_of(FULL).model.segments:
+            raise ValueError(
+                f"{name} is about semantics: expected a preset that trains a segmentation head, found "
+                f"{reproduction.preset}"
+            )
         for seq in recordings if experiment.needs_labels else ():
             if not reproduction.recording(seq).has_labels:
                 raise ValueError(f"{name} is about semantics: expected labels in sequence {seq} of {data}, found none")

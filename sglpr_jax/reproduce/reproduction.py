@@ -1,12 +1,14 @@
 """A reproduction of the paper: trains models, computes descriptors and scores, and keeps the results in folders."""
 
 import functools
+import hashlib
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from sglpr_jax.data.choices import PoseChoice
-from sglpr_jax.data.corruption import CLEAN, ROTATION
+from sglpr_jax.data.fingerprint import fingerprint
 from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation.learning_curves import LearningCurves
@@ -20,11 +22,11 @@ from sglpr_jax.models.weights import Params
 from sglpr_jax.models.weights_file import load
 from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, TOP1, VARIANTS, variant_config
-from sglpr_jax.retrieval.descriptor_cache import embed_or_reuse
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.embed import embed
 from sglpr_jax.training.callbacks import Callbacks, ProgressBar
 from sglpr_jax.training.config import TrainConfig
-from sglpr_jax.training.recipe import LIMITS, TrainResult, run_settings, train
+from sglpr_jax.training.recipe import LIMITS, TrainResult, run_settings, train, with_teacher
 from sglpr_jax.training.run_folder import CONFIG_FILE, require_same_settings
 
 ROTATION_SEED = 0
@@ -67,7 +69,7 @@ class Reproduction:
 
     def config_of(self, variant: str) -> TrainConfig:
         """Return the configuration of a variant."""
-        return variant_config(self.config, variant)
+        return with_teacher(variant_config(self.config, variant))
 
     def is_trained(self, variant: str, seq: str) -> bool:
         """Return whether a run has done all steps. Raises ValueError if it has other settings or more steps."""
@@ -134,17 +136,18 @@ class Reproduction:
         """
         recording = of or self.recording(seq)
         folder = self._folder(method, seq) if method in VARIANTS else self.folder / WITHOUT_TRAINING / file_name(method)
-        (folder / "descriptors").mkdir(parents=True, exist_ok=True)
-        corruption = ROTATION if rotated else CLEAN
-        return embed_or_reuse(
-            folder / "descriptors" / f"{file_name(recording.name)}-{corruption.name}.npz",
-            self._method(method, seq, recording),
-            recording,
-            rotation_seed=ROTATION_SEED if rotated else None,
-            batch=BATCH,
-            title=f"embed {method} {recording.name}",
-            progress=self.progress,
-        )
+        describer, seed = self._method(method, seq, recording), ROTATION_SEED if rotated else None
+        settings = [fingerprint(recording), recording.pose_source, seed, describer.weights_hash, describer.about]
+        settings_hash = hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:12]
+        kind = "rotated" if rotated else "raw"
+        path = folder / "descriptors" / f"{file_name(recording.name)}-{kind}-{settings_hash}.npz"
+        if path.exists():
+            return DescriptorFile.load(path)
+        with self.progress(f"embed {method} {recording.name}", len(recording)) as show:
+            file = embed(describer, recording, rotation_seed=seed, batch=BATCH, on_progress=show)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file.save(path)
+        return file
 
     @functools.cache  # noqa: B019  a process has one reproduction
     def score(self, method: str, seq: str, protocol: str = TOP1, *, rotated: bool = False) -> Result:

@@ -4,7 +4,6 @@ A query takes time in proportion to the number of places; adding a place does no
 """
 
 import dataclasses
-import hashlib
 import itertools
 import json
 from collections.abc import Mapping, Sequence
@@ -17,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from sglpr_jax.data.choices import Scale
-from sglpr_jax.data.formats.tensors import tensors_as_bytes
+from sglpr_jax.data.formats.tensors import hash_of, tensors_as_bytes
 from sglpr_jax.fields import Size, check_value
 from sglpr_jax.files import in_short, naming, parse_json, write_bytes
 from sglpr_jax.growing import GrowingArray
@@ -240,7 +239,7 @@ class Index:
         about = {name: getattr(self, name) for name in ABOUT}
         text = json.dumps({"format": FORMAT, **about})
         arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
-        return tensors_as_bytes(arrays, {"about": text, "sha256": _checksum(text, arrays)})
+        return tensors_as_bytes(arrays, {"about": text, "sha256": hash_of(arrays, about=text)})
 
     @classmethod
     def load(cls, path: Path | str, *, weights_hash: str | None = None) -> "Index":
@@ -311,15 +310,6 @@ class Index:
         return self._lengths.rows
 
 
-def _checksum(about: str, arrays: dict[str, np.ndarray]) -> str:
-    """Return the SHA-256 of a file's JSON text and of the name, shape, type and bytes of each array."""
-    digest = hashlib.sha256(about.encode())
-    for name, values in sorted(arrays.items()):
-        digest.update(f"{name} {values.shape} {values.dtype}".encode())
-        digest.update(np.ascontiguousarray(values).tobytes())
-    return digest.hexdigest()
-
-
 def _read_index_file(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return the JSON header (`ABOUT`) and the arrays of a file. Raises ValueError if it is damaged or no index."""
     if not path.is_file():
@@ -332,7 +322,7 @@ def _read_index_file(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]
         expected = "expected an index or a map of places"
         raise ValueError(f"{path}: {expected}, found an invalid safetensors file ({in_short(error)})") from error
     text = metadata.get("about", "")
-    if metadata.get("sha256") != _checksum(text, arrays):
+    if metadata.get("sha256") != hash_of(arrays, about=text):
         raise ValueError(f"{path}: expected an index with a valid checksum, found a damaged one")
     about = parse_json(text, source=f"{path}, `about`")
     if isinstance(about, dict):

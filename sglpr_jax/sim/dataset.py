@@ -26,10 +26,9 @@ from sglpr_jax.sim.recording import (
 from sglpr_jax.sim.routes import ROLES
 from sglpr_jax.sim.sceneries import REPEATING
 from sglpr_jax.sim.sensor import SENSORS, Sensor
-from sglpr_jax.sim.styles import SCENERIES, TOWN
+from sglpr_jax.sim.styles import SCENERIES
 
-VERSION = 3  # version of the simulator's output; it changes whenever the scans of a seed change
-OLD_NAMES = {"crossing_every": "crossing_every_m", "wavelength": "wavelength_m"}  # current names of old fields
+VERSION = 4  # version of the simulator's output; it changes whenever the scans of a seed change
 WORKERS = 2  # rendering threads; the compiled program leaves capacity for more than one
 ROUTES = ("00", "05", "08")  # default routes in towns
 REVISITED = ("01", "06", "08")
@@ -93,7 +92,8 @@ def simulate(
 
     Arguments:
       out: Output folder.
-      routes: Routes "00" to "10", each with its own town. None drives 00, 05 and 08, or no route if there is `along`.
+      routes: Routes "00" to "10", each with its own town. None drives 00, 05 and 08, where places repeat 01, 06 and 08,
+        or no route if there is `along`.
       along: KITTI pose files to drive along, see `read_path`.
       sessions: Dates such as "2012-01-15" on which one town is driven, in NCLT's layout, see `plan_sessions`. `routes`
         may then hold one route; None is 00.
@@ -143,6 +143,7 @@ def simulate(
         "scenery": {"repeating": scenery} if is_repeating else dataclasses.asdict(SCENERIES[scenery]),
         "sensor": dataclasses.asdict(lidar),
         "carrier": dataclasses.asdict(CARRIERS[carrier]),
+        **of_drives,
         **options,
     }
     height_m = carried_height_m(CARRIERS[carrier], REPEATING.get(scenery))
@@ -157,7 +158,6 @@ def simulate(
         pose_files = _pose_files(routes, along, scans)
         options |= {"sensor": lidar, "carrier": CARRIERS[carrier], "aside_m": aside_m}
         plans = [_plan(name, file, scenery, submap_m, **options) for name, file in pose_files.items()]
-        settings |= {name: metres for name, metres in of_drives.items() if metres}
     out = Path(out)
     _claim(out, settings, {f"drive {name}": _fingerprint(file) for name, file in pose_files.items()})
     dataset = Simulated(out, tuple(plan.name for plan in plans), scans, layout, lidar)
@@ -273,30 +273,17 @@ def _claim(root: Path, settings: dict, fingerprints: dict[str, str]) -> None:
     path = root / SIMULATION
     if not path.exists() and root.is_dir() and any(not file.name.startswith(".") for file in root.iterdir()):
         raise ValueError(f"{root} holds files that were not simulated (no {SIMULATION}); choose another folder")
-    stored = _read_settings(path) if path.exists() else {}
+    stored = read_json(path) if path.exists() else {}
+    if not isinstance(stored, dict):
+        raise ValueError(f"{path}: expected the settings of a simulated dataset, found {stored!r:.60}")
     expected = json.loads(json.dumps({**settings, **fingerprints}))  # as read from JSON: tuples become lists
-    not_in_older = {name: expected[name] for name in ("height_m",) if name in expected}
-    merged = {**fingerprints, **not_in_older, **(stored or expected)}
+    merged = {**fingerprints, **(stored or expected)}
     different = [key for key, value in expected.items() if merged.get(key) != value]
     if different:
         described = ", ".join(f"{key} {expected[key]} (found {stored.get(key)})" for key in different)
         raise ValueError(f"{path} belongs to another simulated dataset; expected {described}; choose another folder")
     if merged != stored:
         write_bytes(path, json.dumps(merged, indent=1, sort_keys=True).encode())
-
-
-def _read_settings(path: Path) -> dict:
-    """Stored settings with the current field names, and with the values of fields that older datasets lack."""
-    settings = read_json(path)
-    scenery = settings.get("scenery", dataclasses.asdict(TOWN)) if isinstance(settings, dict) else None
-    if not isinstance(scenery, dict):
-        raise ValueError(f"{path}: expected the settings of a simulated dataset, found {settings!r:.60}")
-    scenery = {OLD_NAMES.get(name, name): value for name, value in scenery.items()}
-    sensor = settings.get("sensor")
-    if isinstance(sensor, dict):
-        sensor = {"azimuths_deg": Sensor.azimuths_deg, "pattern": Sensor.pattern, **sensor}
-    carrier = settings.get("carrier", dataclasses.asdict(CARRIERS["vehicle"]))
-    return {**settings, **json.loads(json.dumps({"carrier": carrier, "sensor": sensor, "scenery": scenery}))}
 
 
 def _write_drive(root: Path, plan: PlannedRecording, layout: Layout, progress: Callable[[int], None]) -> None:
@@ -323,5 +310,5 @@ def _write_drive(root: Path, plan: PlannedRecording, layout: Layout, progress: C
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    for file, content in layout.drive_contents(recording.poses).items():
+    for file, content in layout.drive_contents(recording.poses, recording.mounting).items():
         write_bytes(layout.file_of_drive(root, plan.name, file), content)

@@ -11,12 +11,12 @@ from jaxtyping import Float, Int
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.data.formats.pose_files import read_poses, read_times
-from sglpr_jax.se3 import positions_from_camera
+from sglpr_jax.data.formats.pose_files import read_kitti, read_times
+from sglpr_jax.se3 import yaw_of
 from sglpr_jax.sim import RATE_HZ
 from sglpr_jax.sim.ground import Relief, relief_gradient, relief_height
 from sglpr_jax.sim.objects import Range
-from sglpr_jax.sim.routes import ROLES, STEP_M, Line, plan_route, travelled
+from sglpr_jax.sim.routes import ROLES, STEP_M, Line, lengths_along, plan_route
 
 PATH_HZ = 10.0  # approximate number of poses per second along the path, of which the scans use some
 SHORTEST_S = 60.0  # minimum duration of a drive, in seconds, which allows revisits after 30 s
@@ -69,7 +69,7 @@ def plan_path(
     role = ROLES[name]
     seconds = max(scans / rate_hz, SHORTEST_S)
     middle = plan_route(rng, role, blocks=round(seconds * role.speed_mps / role.block_m), days=days)
-    right_m = np.mean(LANE_M) + np.ptp(LANE_M) / 2 * waves(rng, travelled(middle), SWAY_WAVELENGTH_M)
+    right_m = np.mean(LANE_M) + np.ptp(LANE_M) / 2 * waves(rng, lengths_along(middle), SWAY_WAVELENGTH_M)
     line = gaussian_filter1d(shifted(middle, -right_m), STEERING_M / STEP_M, axis=0, mode="nearest")
     return timed(rng, line, free_mps=FREE_SPEED * role.speed_mps, poses=scans * days)
 
@@ -97,7 +97,7 @@ def read_path(file: Path) -> PlanarPath:
       FileNotFoundError: The file does not exist.
       ValueError: A file is malformed. The message names file and line.
     """
-    poses = read_poses(file)
+    poses = read_kitti(file)
     if len(poses) < 2:
         raise ValueError(f"{file}: expected 2 poses or more, 12 numbers a line, found {len(poses)}")
     times_file = file.parent / "times.txt"
@@ -108,8 +108,7 @@ def read_path(file: Path) -> PlanarPath:
     if not np.all(np.diff(times) > 0):
         line = int(np.argmin(np.diff(times))) + 2
         raise ValueError(f"{times_file}, line {line}: expected a time > {times[line - 2]}, found {times[line - 1]}")
-    yaw = np.arctan2(-poses[:, 0, 2], poses[:, 2, 2])  # where the camera's z axis points
-    return PlanarPath(positions_from_camera(poses)[:, :2], yaw, times - times[0])
+    return PlanarPath(poses[:, :2, 3], yaw_of(poses), times - times[0])
 
 
 def name_of_path(file: Path) -> str:
@@ -120,13 +119,6 @@ def name_of_path(file: Path) -> str:
 def scan_rows(path: PlanarPath, scans: int) -> Int[np.ndarray, " n"]:
     """Indices of every k-th pose of a path, with the smallest k that gives at most `scans` poses."""
     return np.arange(0, len(path.times), -(-len(path.times) // scans))
-
-
-def speeds(path: PlanarPath) -> Float[np.ndarray, " n"]:
-    """Speed of the vehicle at each pose, in m/s. It is negative where the vehicle reverses."""
-    velocity = np.gradient(path.xy, path.times, axis=0)
-    forward = velocity[:, 0] * np.cos(path.yaw) + velocity[:, 1] * np.sin(path.yaw)
-    return np.where(forward < 0, -1, 1) * np.linalg.norm(velocity, axis=1)
 
 
 def check_rate_and_seed(rate_hz: float, seed: int) -> None:
@@ -194,7 +186,7 @@ def _times_of_points(
     rng: np.random.Generator, line: Float[np.ndarray, "n 2"], heading: Float[np.ndarray, " n"], free_mps: float
 ) -> Float[np.ndarray, " n"]:
     """Time of each point of `line`, for the highest speed that streets, corners and a car's acceleration allow."""
-    length = travelled(line)
+    length = lengths_along(line)
     curvature = np.abs(np.gradient(heading, length)).clip(min=1e-6)
     free_speed = free_mps * (1 + 0.2 * waves(rng, length, SWAY_WAVELENGTH_M))
     max_v2 = np.minimum(free_speed**2, LATERAL_ACCELERATION / curvature)  # maximum of the squared speed
@@ -252,7 +244,7 @@ class Carrier:
     def _knots(self, rng: np.random.Generator, path: PlanarPath) -> tuple[list[float], list[float]]:
         """Draws halts. Returns times of the drive with halts, and times at which `path` is at the same positions."""
         assert self.halt_every_s is not None
-        times, path_times, length = [0.0], [0.0], travelled(path.xy)
+        times, path_times, length = [0.0], [0.0], lengths_along(path.xy)
 
         def add_knot(seconds: float, path_time: float) -> None:
             times.append(times[-1] + seconds)

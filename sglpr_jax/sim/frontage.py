@@ -119,8 +119,8 @@ def _street_furniture(rng: np.random.Generator, side: Side, start: float, stop: 
 def _tree_row(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Spot]:
     """Street trees, on the median if the street has one. The median of a highway has a guard rail instead.
 
-    Distances are from the edge of the road, outwards, or from the middle of the road in a median. `side.verge` is the
-    distance of the outer edge of the last strip, and trees stand 0.5 m behind the inner edge of this strip.
+    Distances are from the edge of the road, outwards. `side.verge` is the distance of the outer edge of the last strip,
+    and trees stand 0.5 m behind the inner edge of this strip.
     """
     if side.median and side.border == "rail":
         yield from _border_pieces(rng, "rail", start, stop, side.median / 2, "verge")

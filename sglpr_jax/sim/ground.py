@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sglpr_jax.sim.labels import LANE_MARKING, OTHER_GROUND, PARKING, ROAD
+from sglpr_jax.sim.objects import Range
 from sglpr_jax.sim.shapes import AnyArray, Vectors
-from sglpr_jax.sim.styles import TOWN, Scenery
+from sglpr_jax.sim.styles import Scenery
 
 CELL_M = 0.25  # size of a cell of the raster, in metres
 KERB_M = 0.12  # height of sidewalks, gardens and fields above the road, in metres
@@ -32,11 +33,13 @@ class Relief(NamedTuple):
     phase: np.ndarray  # (k,) radians
 
 
-def draw_relief(rng: np.random.Generator, scenery: Scenery = TOWN) -> Relief:
-    """Draws hills with a slope of at most `scenery.steepest`. Some drives are nearly flat."""
-    wave_number = 2 * np.pi / rng.uniform(*scenery.wavelength_m, _WAVES)
+def draw_relief(
+    rng: np.random.Generator, *, steepest: float = Scenery.steepest, wavelength_m: Range = Scenery.wavelength_m
+) -> Relief:
+    """Draws hills with a slope of at most `steepest`. Some drives are nearly flat."""
+    wave_number = 2 * np.pi / rng.uniform(*wavelength_m, _WAVES)
     bearing = rng.uniform(0, 2 * np.pi, _WAVES)
-    slopes = rng.uniform(0.2, 1.0) * scenery.steepest * rng.dirichlet(np.ones(_WAVES))  # sum <= scenery.steepest
+    slopes = rng.uniform(0.2, 1.0) * steepest * rng.dirichlet(np.ones(_WAVES))  # sum <= steepest
     wave = wave_number[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
     return Relief(slopes / wave_number, wave, rng.uniform(0, 2 * np.pi, _WAVES))
 

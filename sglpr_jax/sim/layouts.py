@@ -16,10 +16,9 @@ from sglpr_jax.data.corruption import Corruption, corrupt, ring_numbers
 from sglpr_jax.data.density_image import density_image, density_label_image
 from sglpr_jax.data.formats.bin_records import NCLT_OFFSET_M, NCLT_RECORD, NCLT_UNIT_M, Z_UP_FROM_Z_DOWN
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
-from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.views import rotated
 from sglpr_jax.sim.drive import TimedPoses
-from sglpr_jax.sim.sensor import NCLT_HEIGHT_M
 
 THINNED, FEWER_BEAMS = 0.4, 0.3
 """Fraction of the scans that lose random points, and fraction that loses whole rings. Other scans keep all points."""
@@ -37,7 +36,7 @@ class Layout(NamedTuple):
 
     A mounting of None is the mounting that the models expect.
     """
-    drive_contents: Callable[[TimedPoses], dict[str, bytes]]
+    drive_contents: Callable[[TimedPoses, Mounting | None], dict[str, bytes]]
     """Function that returns the contents of the files of the whole drive, by name. They are written after all scans."""
     last_file: str  # last of the files of the whole drive; if it exists, the drive is complete
 
@@ -82,7 +81,7 @@ def _matrix_line(matrix: Float[np.ndarray, "r 4"]) -> str:
     return " ".join(f"{value:.9g}" for value in matrix[:3].ravel()) + "\n"
 
 
-def _kitti_files(poses: TimedPoses) -> dict[str, bytes]:
+def _kitti_files(poses: TimedPoses, _mounting: Mounting | None) -> dict[str, bytes]:
     """Calibration with identity projections, times, and poses world_from_camera, both in a camera's axes."""
     projections = "".join(f"P{i}: {_matrix_line(np.eye(4))}" for i in range(4))
     world_from_camera = CAMERA_FROM_LIDAR @ poses.world_from_lidar @ CAMERA_FROM_LIDAR.T
@@ -93,9 +92,13 @@ def _kitti_files(poses: TimedPoses) -> dict[str, bytes]:
     }
 
 
-def _nclt_scan(points: Float[np.ndarray, "n 4"], _labels: np.ndarray, _mounting: Mounting | None) -> tuple[bytes, ...]:
+def _height_m(mounting: Mounting | None) -> float:
+    return MODEL_HEIGHT_M if mounting is None else mounting.height_m
+
+
+def _nclt_scan(points: Float[np.ndarray, "n 4"], _labels: np.ndarray, mounting: Mounting | None) -> tuple[bytes, ...]:
     """Bytes of a scan in NCLT's body frame: x forward, y right, z down, origin on the ground."""
-    above_ground = np.add(points[:, :3].astype(np.float64), [0, 0, NCLT_HEIGHT_M])
+    above_ground = np.add(points[:, :3].astype(np.float64), [0, 0, _height_m(mounting)])
     body = above_ground * Z_UP_FROM_Z_DOWN
     records = np.zeros(len(points), NCLT_RECORD)
     records["xyz"] = np.round((body - NCLT_OFFSET_M) / NCLT_UNIT_M)
@@ -103,10 +106,10 @@ def _nclt_scan(points: Float[np.ndarray, "n 4"], _labels: np.ndarray, _mounting:
     return (records.tobytes(),)
 
 
-def _nclt_files(poses: TimedPoses) -> dict[str, bytes]:
+def _nclt_files(poses: TimedPoses, mounting: Mounting | None) -> dict[str, bytes]:
     """Ground truth in the axes north, east, down, with one row per scan."""
     lidar_from_body = np.eye(4)
-    lidar_from_body[2, 3] = -NCLT_HEIGHT_M
+    lidar_from_body[2, 3] = -_height_m(mounting)
     world_from_body = poses.world_from_lidar @ lidar_from_body
     rotations = np.diag(Z_UP_FROM_Z_DOWN) @ world_from_body[:, :3, :3] @ np.diag(Z_UP_FROM_Z_DOWN)
     roll_pitch_yaw = Rotation.from_matrix(rotations).as_euler("ZYX")[:, ::-1]
@@ -125,7 +128,7 @@ _IMAGES = Layout(
     folder="{name}",
     scan_files=("imgs/{id}.png", "labels/{id}.png"),
     scan_contents=_image_and_labels,
-    drive_contents=lambda poses: {"pose.txt": "".join(map(_matrix_line, poses.world_from_lidar)).encode()},
+    drive_contents=lambda poses, _: {"pose.txt": "".join(map(_matrix_line, poses.world_from_lidar)).encode()},
     last_file="pose.txt",
 )
 LAYOUTS = {

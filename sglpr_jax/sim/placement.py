@@ -33,6 +33,23 @@ class Spot(NamedTuple):
     zone: Zone = "plot"
 
 
+def moving_spots(
+    thing: ObjectModel,
+    begin: Float[np.ndarray, "n 2"],
+    end: Float[np.ndarray, "n 2"],
+    heading: Float[np.ndarray, " n"],
+    since: Float[np.ndarray, " n"],
+    until: Float[np.ndarray, " n"],
+) -> list[Spot]:
+    """Straight motions of `thing` from `begin` to `end`, on the ground in the middle between them."""
+    velocity = (end - begin) / (until - since)[:, None]
+    rows = np.column_stack([(begin + end) / 2, heading, velocity, since, until, (since + until) / 2]).tolist()
+    return [
+        Spot(thing, x, y, turn, velocity=(vx, vy), since=since, until=until, time=time)
+        for x, y, turn, vx, vy, since, until, time in rows
+    ]
+
+
 class PlacedObjects(NamedTuple):
     """Shapes of all parts of all objects, one row per part."""
 

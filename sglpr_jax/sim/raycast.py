@@ -70,19 +70,15 @@ def find_candidates(
     azimuth_steps: int,
     azimuths_deg: tuple[float, float] = (0.0, 360.0),
     reach_m: float,
-    slots: tuple[int, ...] = SLOTS,
 ) -> tuple[Candidates, ...]:
-    """Lists the boxes, cylinders and ellipsoids within `reach_m` that the rays of each sector may hit at `time`.
-
-    `slots` are the maximum numbers of boxes, cylinders and ellipsoids in a sector. The nearest are kept.
-    """
+    """Lists the boxes, cylinders and ellipsoids within `reach_m` that the rays of each sector may hit at `time`."""
     first, last = np.radians(azimuths_deg)
     step = (last - first) / azimuth_steps
     sector_middle = first + (np.arange(sector_count(azimuth_steps)) * COLUMNS + (COLUMNS - 1) / 2) * step
     sector_half_width = (COLUMNS - 1) / 2 * step + _MARGIN
     sensor_xyz = world_from_lidar[:3, 3]
     candidates = []
-    for shapes, slot_count in zip(scene, slots, strict=True):
+    for shapes, slot_count in zip(scene, SLOTS, strict=True):
         present = at_time(shapes, time, sensor_xyz, reach_m=reach_m)
         shape_middle, shape_half_width = _azimuth_intervals(present, world_from_lidar)
         angle = np.abs(wrap_angle(shape_middle[:, None] - sector_middle))

@@ -29,7 +29,6 @@ from sglpr_jax.sim.drive import (
     poses_on,
     read_path,
     scan_rows,
-    speeds,
     timed,
 )
 from sglpr_jax.sim.layouts import to_utime
@@ -41,8 +40,10 @@ from sglpr_jax.sim.styles import TOWN, Scenery
 from sglpr_jax.sim.world import World, build_world
 
 KEPT_SCANS = 8  # number of cached scans, so that reading points and labels of a scan renders it once
-SHORTEST_S = 75.0  # minimum duration of a drive where places repeat, in seconds, over which few scans are spread
-LEAST_RANGE_M = 0.5  # highest minimum range of the sensor of a small robot, in metres
+SHORTEST_REPEATING_S = (
+    75.0  # minimum duration of a drive where places repeat, in seconds, over which few scans are spread
+)
+CLOSE_RANGE_M = 0.5  # maximum of a sensor's minimum range at the height of a carrier or scenery, in metres
 PAUSE_S = 1800.0  # pause between two days, in seconds: three times the mean stay of a parked car
 START_H = 12  # hour (UTC) at which each session starts
 
@@ -151,7 +152,7 @@ def simulate_repeating(
     world, path = plan_drive(scenery, seeds, scans=scans, revisit=revisit, rate_hz=rate_hz, carrier=carrier)
     height_m = carried_height_m(carrier, scenery)
     if height_m is not None:
-        sensor = dataclasses.replace(sensor, height_m=height_m, min_range_m=min(LEAST_RANGE_M, sensor.min_range_m))
+        sensor = dataclasses.replace(sensor, height_m=height_m, min_range_m=min(CLOSE_RANGE_M, sensor.min_range_m))
     options = {"name": f"{name}-{revisit}", "sensor": sensor, "carrier": carrier, "aside_m": aside_m}
     return drive_through(world, path, scan_rows(path, scans), **options, **_key_and_rng(seeds))
 
@@ -176,9 +177,9 @@ def plan_drive(
     rng = np.random.default_rng((*seeds, 1))
     speed = rng.uniform(*(carrier.speed_mps or scenery.speed_mps))
     passes = {"none": 1, "opposite": 2, "same": LAPS}[revisit]
-    length_m = max(scans / rate_hz, SHORTEST_S) * speed / passes
+    length_m = max(scans / rate_hz, SHORTEST_REPEATING_S) * speed / passes
     if revisit == "same":  # a lap has room for the scenery even if the carrier is slow
-        length_m = max(length_m, SHORTEST_S * scenery.speed_mps[0] / LAPS)
+        length_m = max(length_m, SHORTEST_REPEATING_S * scenery.speed_mps[0] / LAPS)
     site = scenery.site(rng, length_m, scenery.is_closed(revisit))
     line = driven_line(rng, site, revisit, right_m=scenery.right_m, sway_m=scenery.sway_m)
     path = carrier.halted(rng, timed(rng, line, free_mps=speed, poses=scans), poses=scans)
@@ -275,7 +276,7 @@ def drive_through(
     carrier: Carrier = VEHICLE,
     aside_m: float = 0.0,
 ) -> SimulatedRecording:
-    """Returns the recording of a drive through a town along `path`, with scans at the poses in `rows`.
+    """Returns the recording of a drive through a world along `path`, with scans at the poses in `rows`.
 
     By default, `ids` numbers the scans, and `times` (seconds) are those of the path. `key` draws the measurements, and
     `rng` the sway. The carrier determines height and sway, not the speed. The drive is `aside_m` to the left of `path`.
@@ -291,15 +292,13 @@ def drive_through(
         xy, ground_height, slope = (per_pose[rows] for per_pose in world.levels.along(path.xy))
         rendered_poses = poses_on(world.ground.relief, xy + sway, yaw, height_m=height, tilt=tilt)
         true_poses = poses_on((ground_height, slope), path.xy[rows] + sway, yaw, height_m=height, tilt=tilt)
-    speed = speeds(path)[rows]
     row_of_id = {scan_id: i for i, scan_id in enumerate(ids)}
 
     @functools.lru_cache(maxsize=KEPT_SCANS)
     def render(i: int) -> tuple[np.ndarray, np.ndarray]:
-        options = {"sensor": sensor, "time": float(path_times[i]), "velocity": np.array([speed[i], 0, 0])}
-        return scan(jax.random.fold_in(key, i), world, rendered_poses[i], **options)
+        return scan(jax.random.fold_in(key, i), world, rendered_poses[i], sensor=sensor, time=float(path_times[i]))
 
-    def read(path: Path, label_path: Path | None, lasers: bool) -> Scan:
+    def read(path: Path, label_path: Path | None) -> Scan:
         points, labels = render(row_of_id[path.name])
         return Scan(points=points[:, :3], labels=None if label_path is None else labels)
 

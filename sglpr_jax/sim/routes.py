@@ -80,14 +80,14 @@ def plan_route(rng: np.random.Generator, role: Role, *, blocks: int, days: int =
     return resampled(gaussian_filter1d(corners, role.corner_m / STEP_M, axis=0, mode="nearest"), STEP_M)
 
 
-def travelled(line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+def lengths_along(line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
     """Length of a line up to each of its points."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
 
 
 def resampled(line: Float[np.ndarray, "n 2"], step_m: float) -> Float[np.ndarray, "m 2"]:
     """Resamples a line to points about `step_m` metres apart."""
-    length = travelled(line)
+    length = lengths_along(line)
     even_lengths = np.linspace(0, length[-1], max(2, round(length[-1] / step_m) + 1))
     return np.stack([np.interp(even_lengths, length, axis) for axis in line.T], axis=1)
 

@@ -31,17 +31,16 @@ from sglpr_jax.sim.world import World
 
 HDL64E_DEG = (*np.linspace(2.0, -8.33, 32).tolist(), *np.linspace(-8.83, -24.8, 32).tolist())
 """Elevations of the HDL-64E in degrees: two blocks of 32 lasers, with a smaller spacing in the upper block."""
-NCLT_HEIGHT_M = 1.03
 
 
 def _even(first_deg: float, last_deg: float, count: int) -> tuple[float, ...]:
-    """Equally spaced elevations from the top, in degrees."""
+    """Equally spaced elevations, in degrees."""
     return tuple(np.linspace(first_deg, last_deg, count).tolist())
 
 
-def _bands(first_deg: float, last_deg: float, count: int) -> tuple[float, ...]:
+def _bands(low_deg: float, high_deg: float, count: int) -> tuple[float, ...]:
     """Middle of each of `count` equal bands of elevation, from the top, in degrees."""
-    edges = np.linspace(last_deg, first_deg, count + 1)
+    edges = np.linspace(high_deg, low_deg, count + 1)
     return tuple(((edges[:-1] + edges[1:]) / 2).tolist())
 
 
@@ -75,8 +74,6 @@ class Sensor:
     shadows_deg: tuple[tuple[float, float, float], ...] = ()
     """Occlusions by the vehicle: first azimuth, last azimuth (counter-clockwise) and elevation below which no ray
     between these azimuths returns, all in degrees."""
-    motion_distortion: bool = False
-    """Whether points are relative to the sensor's position when they were measured, instead of the scan's pose."""
 
     def __post_init__(self):
         if not self.elevations_deg or self.azimuth_steps < 1:
@@ -101,7 +98,7 @@ SENSORS = {
     "hdl64e": HDL64E,
     "hdl32e": Sensor(_even(10.67, -30.67, 32), azimuth_steps=2160, min_range_m=1.0, height_m=1.9),
     # Mounted upside down on a Segway. Elevations and height fit a real scan of NCLT.
-    "hdl32e-nclt": Sensor(_even(-10.67, 30.67, 32), azimuth_steps=2160, min_range_m=1.9, height_m=NCLT_HEIGHT_M),
+    "hdl32e-nclt": Sensor(_even(-10.67, 30.67, 32), azimuth_steps=2160, min_range_m=1.9, height_m=1.03),
     "vlp16": Sensor(_even(15.0, -15.0, 16), min_range_m=0.5, height_m=1.8, range_noise_m=0.03),
     "xt32": Sensor(_even(15.0, -16.0, 32), azimuth_steps=2000, min_range_m=0.5, height_m=0.8, range_noise_m=0.01),
     "os1-64": Sensor(_even(22.5, -22.5, 64), azimuth_steps=1024, min_range_m=0.5, height_m=1.2),
@@ -130,7 +127,6 @@ class View(NamedTuple):
     candidates: tuple[Candidates, ...]
     ground: GroundView
     rotation: AnyArray  # (3, 3) rotation of world_from_lidar
-    velocity: AnyArray  # (3,) velocity of the sensor in its own frame, m/s
     rays: Vectors | None = None  # unit vectors of the rays; None if they are the same in every scan
 
 
@@ -149,36 +145,26 @@ def scan(
     *,
     sensor: Sensor = HDL64E,
     time: float = 0.0,
-    velocity: Float[np.ndarray, "3"] | None = None,
 ) -> tuple[Float[np.ndarray, "n 4"], Int[np.ndarray, " n"]]:
     """Simulates one scan of a world at `time` (seconds): points laser by laser, each counter-clockwise, as in KITTI.
-
-    A sensor with `motion_distortion` needs its `velocity` in its own frame, in m/s.
 
     Returns:
       Points (x, y, z in metres in the LiDAR frame, intensity from 0 to 1) and their raw labels.
 
     Raises:
-      ValueError: The pose is not rigid, or a needed velocity is missing.
+      ValueError: The pose is not rigid.
     """
-    view = view_of(world, world_from_lidar, sensor=sensor, time=time, velocity=velocity)
+    view = view_of(world, world_from_lidar, sensor=sensor, time=time)
     return returned_points(cast_turn(key, view, sensor=sensor))
 
 
 def view_of(
-    world: World,
-    world_from_lidar: Float[np.ndarray, "4 4"],
-    *,
-    sensor: Sensor = HDL64E,
-    time: float = 0.0,
-    velocity: Float[np.ndarray, "3"] | None = None,
+    world: World, world_from_lidar: Float[np.ndarray, "4 4"], *, sensor: Sensor = HDL64E, time: float = 0.0
 ) -> View:
     """Selects the shapes and the ground that the sensor may hit from a pose. Raises the errors of `scan`."""
     rotation = world_from_lidar[:3, :3]
     if not (np.isfinite(world_from_lidar).all() and are_rotations(rotation)):
         raise ValueError(f"expected a pose of rotation and translation, found {world_from_lidar.tolist()}")
-    if sensor.motion_distortion and velocity is None:
-        raise ValueError("a sensor with motion_distortion needs the velocity of the sensor, found None")
     candidates = find_candidates(
         world.scene,
         world_from_lidar,
@@ -188,9 +174,8 @@ def view_of(
         reach_m=sensor.max_range_m,
     )
     ground = ground_view(world.ground, world_from_lidar[:3, 3], reach_m=sensor.max_range_m)
-    velocity = np.zeros(3) if velocity is None else velocity
     rays = None if sensor.pattern == "rings" else _ray_directions(sensor, time=time)
-    return View(candidates, ground, rotation.astype(np.float32), velocity.astype(np.float32), rays)
+    return View(candidates, ground, rotation.astype(np.float32), rays)
 
 
 @functools.partial(jax.jit, static_argnames="sensor")
@@ -199,11 +184,7 @@ def cast_turn(key: Array, view: View, *, sensor: Sensor) -> Turn:
     key_surface, key_echoes = jax.random.split(key)
     surface = first_surface(key_surface, view, sensor=sensor)
     ranges, returned = _measured_ranges(key_echoes, surface, sensor)
-    steps = sensor.azimuth_steps
-    xyz = [axis[:, :steps] * ranges for axis in _rays_of_view(view, sensor)]
-    if sensor.motion_distortion:
-        seconds_from_middle = TURN_S * (jnp.arange(steps, dtype=jnp.float32) / steps - 0.5)
-        xyz = [axis - view.velocity[i] * seconds_from_middle[None, :] for i, axis in enumerate(xyz)]
+    xyz = [axis[:, : sensor.azimuth_steps] * ranges for axis in _rays_of_view(view, sensor)]
     intensity = reflectivity(surface.label) * (0.5 + 0.5 * surface.facing)
     return Turn(jnp.stack([*xyz, intensity], axis=-1), surface.label, returned)
 

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from sglpr_jax.sim.ground import CELL_M, Ground, Relief
 from sglpr_jax.sim.labels import LANE_MARKING, OTHER_GROUND, ROAD, TERRAIN
-from sglpr_jax.sim.routes import Line, travelled
+from sglpr_jax.sim.routes import Line, lengths_along
 from sglpr_jax.sim.styles import STYLES, TOWN, Scenery, Side, draw_side
 
 MIDDLE_M = 1.2  # distance from the first pass to the middle of the street on its left, in metres
@@ -67,7 +67,7 @@ class Island(NamedTuple):
     radius: float  # metres
 
 
-def resample(trajectory: Line, times: Float[np.ndarray, " n"]) -> Path:
+def path_of(trajectory: Line, times: Float[np.ndarray, " n"]) -> Path:
     """Resamples `trajectory` to one point per metre. A standstill becomes one point.
 
     Raises:
@@ -75,7 +75,7 @@ def resample(trajectory: Line, times: Float[np.ndarray, " n"]) -> Path:
     """
     if len(trajectory) < 2 or not (np.isfinite(trajectory).all() and np.all(np.diff(times) > 0)):
         raise ValueError("a trajectory needs two or more finite points at increasing times")
-    length_m = travelled(trajectory)
+    length_m = lengths_along(trajectory)
     moved = np.concatenate([[True], np.diff(length_m) > 1e-6])
     if length_m[-1] < 2:
         raise ValueError(f"a trajectory needs a length of 2 m or more, found {length_m[-1]:.2f} m")

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from sglpr_jax.sim import objects
 from sglpr_jax.sim.objects import ObjectModel, Range
-from sglpr_jax.sim.placement import CLEARANCE_M, Spot, footprint_distance
+from sglpr_jax.sim.placement import CLEARANCE_M, Spot, footprint_distance, moving_spots
 from sglpr_jax.sim.streets import MIDDLE_M, Network, Path
 from sglpr_jax.sim.styles import Side
 
@@ -137,13 +137,7 @@ def _pieces(
     heading = np.interp((before + after) / 2, index, path.heading) + (np.pi if direction < 0 else 0.0)
     pieces = (xy[:-1][on_path], xy[1:][on_path], heading[on_path], times[:-1][on_path], times[1:][on_path])
     is_clear = _is_clear_of_vehicle(thing, pieces, path)
-    begin, end, heading, since, until = (column[is_clear] for column in pieces)
-    velocity = (end - begin) / (until - since)[:, None]
-    rows = np.column_stack([(begin + end) / 2, heading, velocity, since, until, (since + until) / 2]).tolist()
-    return [
-        Spot(thing, x, y, turn, velocity=(vx, vy), since=since, until=until, time=time)
-        for x, y, turn, vx, vy, since, until, time in rows
-    ]
+    return moving_spots(thing, *(column[is_clear] for column in pieces))
 
 
 def _is_clear_of_vehicle(thing: ObjectModel, pieces: tuple[np.ndarray, ...], path: Path) -> Bool[np.ndarray, " k"]:

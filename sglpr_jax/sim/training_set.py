@@ -31,7 +31,7 @@ VARIANTS: tuple[dict[str, Any], ...] = (
     {"sensor": "hdl32e"},
 )
 """Other views of a world. Each seed has two of them, in turn."""
-SENSORS = ("vlp16", "os1-64", "hdl32e", "xt32", "os0-32", "hdl32e-nclt", "mid360", "hdl64e")
+REPEATING_SENSORS = ("vlp16", "os1-64", "hdl32e", "xt32", "os0-32", "hdl32e-nclt", "mid360", "hdl64e")
 """Sensors of the repeating sceneries, in turn."""
 FIRINGS = 900
 """Azimuth steps of all sensors. At 25 m, the end of the image, rays are 0.17 m apart, less than a cell of 0.4 m."""
@@ -52,7 +52,7 @@ def _datasets() -> Iterator[tuple[str, dict[str, Any]]]:
                 yield f"{scenery}-{seed}-{_name(variant)}", {**world, "routes": BOTH_DIRECTIONS, **variant}
     for seed in REPEATING_SEEDS:
         for number, scenery in enumerate(REPEATING, start=seed):  # the next seed has the next sensor
-            drive = {"sensor": SENSORS[number % len(SENSORS)], "vary": number % 2 == 1}
+            drive = {"sensor": REPEATING_SENSORS[number % len(REPEATING_SENSORS)], "vary": number % 2 == 1}
             yield f"{scenery}-{seed}", {"scenery": scenery, "seed": seed, "routes": BOTH_DIRECTIONS, **drive}
 
 

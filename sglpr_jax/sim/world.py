@@ -13,7 +13,7 @@ from sglpr_jax.sim.objects import bush
 from sglpr_jax.sim.placement import CLEARANCE_M, HEAD_ROOM_M, PlacedObjects, Spot, distances, place, to_scene
 from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.shapes import Scene
-from sglpr_jax.sim.streets import Island, Network, draw_streets, paint_ground, resample, roundabouts, runs
+from sglpr_jax.sim.streets import Island, Network, draw_streets, paint_ground, path_of, roundabouts, runs
 from sglpr_jax.sim.styles import TOWN, Scenery
 from sglpr_jax.sim.traffic import traffic
 
@@ -73,8 +73,8 @@ def build_world(
       ValueError: The trajectory is shorter than 2 m or not finite, or `times` do not increase.
     """
     rng = np.random.default_rng(seed)
-    path = resample(trajectory, times)
-    relief = draw_relief(rng, scenery)
+    path = path_of(trajectory, times)
+    relief = draw_relief(rng, steepest=scenery.steepest, wavelength_m=scenery.wavelength_m)
     network, islands = Network(draw_streets(rng, path, scenery)), roundabouts(path)
     ground = paint_ground(network, islands, relief, path.xy)
     clock = (float(times[0]), float(times[-1]))

@@ -10,7 +10,7 @@ from typing import Any
 
 from rich.console import Console
 
-from sglpr_jax.extras import install_command
+from sglpr_jax.extras import optional_module
 from sglpr_jax.files import raising_write_error
 from sglpr_jax.progress import progress_bar
 from sglpr_jax.training.loss_terms import TERM_NAMES
@@ -44,7 +44,7 @@ class Callback:
         """Called every `score_every` steps with the scores of the weights."""
 
     def on_checkpoint(self, step: int) -> None:
-        """Called when a checkpoint of the weights after this step is being written."""
+        """Called after the checkpoint that follows a score is written, not for other checkpoints, as after a stop."""
 
     def on_end(self, step: int) -> None:
         """Called after the last step, or after this step if the run was asked to stop. The weights are saved."""
@@ -118,10 +118,7 @@ class EventFiles(Callback):
     """
 
     def __init__(self, folder: Path):
-        try:
-            import tensorboardX  # noqa: F401
-        except ImportError as error:
-            raise ImportError(f"event files need tensorboardX: {install_command('tensorboard')}") from error
+        optional_module("tensorboardX", "writing of event files", extra="tensorboard")
         self._folder = folder
         self._writer: Any = None
 

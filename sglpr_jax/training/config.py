@@ -19,10 +19,6 @@ class LossConfig:
     """Margin of the triplet loss."""
     squared: bool = False
     """Use squared descriptor distances in equation 5."""
-    closest_positive: bool = True
-    """Compare the anchor with its closest positive. If False, compare it with its farthest positive."""
-    reduction: Literal["max", "sum"] = "max"
-    """`max` is the lazy triplet loss. `sum` adds up all negatives inside the margin."""
     temperature: NotNegative = 0.0
     """If above 0, use the smooth form of the lazy loss, which hard negatives cannot collapse."""
     one_threshold: Share = 0.0
@@ -84,7 +80,6 @@ class OptimizerConfig:
     """Let the learning rate fall in jumps instead of continuously."""
     clip_norm: Positive | None = None
     """Maximum global norm of the gradient. None: no clipping."""
-    weight_decay: NotNegative = 0.0
 
     def __post_init__(self):
         check_fields(self)
@@ -162,11 +157,6 @@ class TrainConfig:
             )
         if self.loss.segmentation_alone and not self.model.segments:
             raise ValueError("loss.segmentation_alone: expected a model with a segmentation head, found one without")
-        if self.loss.segmentation_alone and self.optimizer.weight_decay:
-            raise ValueError(
-                "loss.segmentation_alone freezes all other weights: expected optimizer.weight_decay 0, "
-                f"found {self.optimizer.weight_decay}"
-            )
         if self.chunk and self.images % self.chunk:
             raise ValueError(f"chunk must divide the {self.images} images of a step, found {self.chunk}")
         if self.images_at_once % self.loss.segment_every:

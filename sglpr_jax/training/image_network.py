@@ -54,11 +54,9 @@ class ImageNetwork:
         )
         clip = optax.identity() if config.clip_norm is None else optax.clip_by_global_norm(config.clip_norm)
         if config.algorithm == "adam":
-            return optax.chain(clip, optax.adamw(schedule, weight_decay=config.weight_decay))
+            return optax.chain(clip, optax.adam(schedule))
         muon = optax.contrib.muon(
             schedule,
-            weight_decay=config.weight_decay,
-            adam_weight_decay=config.weight_decay,
             adam_learning_rate=lambda step: VECTOR_RATE * schedule(step),
             muon_weight_dimension_numbers=_matrices,
         )

@@ -48,7 +48,8 @@ def triplet(descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig) 
     The fraction `config.one_threshold` of it is the loss in which every anchor has the negatives of all anchors.
     """
     to_positives, to_places = _anchor_distances(descriptors, batch, config)
-    options: dict[str, Any] = _triplet_options(batch, config) | {"temperature": config.temperature}
+    where = jnp.asarray(batch.negatives)
+    options: dict[str, Any] = {"margin": config.margin, "temperature": config.temperature, "where": where}
     own_negatives = losses.lazy_triplet(to_positives, to_places, **options).mean()
     if not config.one_threshold:
         return own_negatives
@@ -59,7 +60,8 @@ def triplet(descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig) 
 def violations(descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig) -> Float[Array, ""]:
     """Return the fraction of tuples that violate the margin: those whose loss without a temperature is above 0."""
     to_positives, to_places = _anchor_distances(descriptors, batch, config)
-    return (losses.lazy_triplet(to_positives, to_places, **_triplet_options(batch, config)) > 0).mean()
+    where = jnp.asarray(batch.negatives)
+    return (losses.lazy_triplet(to_positives, to_places, margin=config.margin, where=where) > 0).mean()
 
 
 def teacher_distance(descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig) -> Float[Array, ""]:
@@ -133,12 +135,3 @@ def _anchor_distances(
     to_positives = losses.descriptor_distance(*jnp.broadcast_arrays(anchors, positives), squared=config.squared)
     to_places = losses.descriptor_distance(*jnp.broadcast_arrays(anchors, descriptors[None]), squared=config.squared)
     return to_positives, to_places
-
-
-def _triplet_options(batch: Batch, config: LossConfig) -> dict[str, Any]:
-    return {
-        "margin": config.margin,
-        "closest_positive": config.closest_positive,
-        "reduction": config.reduction,
-        "where": jnp.asarray(batch.negatives),
-    }

@@ -4,6 +4,7 @@ import hashlib
 import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -92,6 +93,9 @@ def _require_same_shape(inputs: np.ndarray, expected: np.ndarray, *, name: str) 
 
 
 def _cache_key(method: LearnedMethod, recording: Recording) -> str:
-    """Return a hash of what determines the inputs: the recording, and the source file of `prepare`."""
+    """Return a hash of the recording, the version of this package and the source file of `prepare`.
+
+    After a change of other sources, such as `methods/cells.py`, delete the cache.
+    """
     code = Path(inspect.getfile(method.prepare)).read_bytes()
-    return hashlib.sha256(fingerprint(recording).encode() + code).hexdigest()[:16]
+    return hashlib.sha256(f"{version('sglpr-jax')} {fingerprint(recording)}".encode() + code).hexdigest()[:16]

@@ -193,7 +193,7 @@ def train_learned(
 
 
 class _ReportLines(Callback):
-    """Reports the loss every 30 s of training and at each checkpoint, and the scores. Shows the training time."""
+    """Reports the loss every 30 s of training and with each score, and the scores. Shows the training time."""
 
     def __init__(self, report: Callable[[str], None], show: Callable[[int], None]):
         self._report, self._show, self._last_report_s, self._line = report, show, 0.0, ""

@@ -14,7 +14,7 @@ from jaxtyping import Float32, Int
 from sglpr_jax.data.packed import packed
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.models.sglpr import init
-from sglpr_jax.models.weights import Params, adopt, graft, weights_hash, without_whitening
+from sglpr_jax.models.weights import Params, adopt, graft, own_hash, weights_hash, without_whitening
 from sglpr_jax.models.weights_file import LAST_WEIGHTS, load, save
 from sglpr_jax.training.batch_source import TupleBatches, training_batches
 from sglpr_jax.training.callbacks import Callback
@@ -87,14 +87,14 @@ def train(
         out: Folder of the run: settings, metrics, checkpoints and the final weights.
         test: Recording of the later test. It is not read; the function only checks that it is not trained on.
         also: Recordings of a second dataset, which provide `config.also_tuples` tuples of each step.
-        weights: Initial weights of a new run: a name, a folder or `Params`. None: random weights.
+        weights: Initial weights: a name, a folder or `Params`. None: random weights. A resumed run needs the same.
         resume: Continue from the newest checkpoint of the run in `out`.
         cache: Folder in which each recording is packed on first use, for faster reading.
         callback: Follows the run: a `ProgressBar`, `EventFiles` or your own.
         stopped: Called after every step. If it returns true, the run saves its state and stops. While recordings are
             packed, a stop raises KeyboardInterrupt.
         settings: Entries of config.json beside `config`. They must be equal in a resumed run. None: the names of the
-            recordings.
+            recordings, and the weights.
 
     Returns:
         The weights and a summary of the run.
@@ -112,15 +112,16 @@ def train(
       print(result)
     """
     folder = Path(out)
-    config = _with_teacher(without_untrained_head(config))
+    config = with_teacher(without_untrained_head(config))
     _require_usable(config, recordings, also, test)
-    if config.loss.segmentation_alone and weights is None and not resume:
+    if config.loss.segmentation_alone and weights is None:
         raise ValueError("loss.segmentation_alone trains no descriptors: expected weights to begin with, found none")
     if settings is None:
         settings = {
             "recordings": [recording.name for recording in recordings],
             "also": [recording.name for recording in also],
             "test": None if test is None else test.name,
+            "weights": own_hash(weights) if isinstance(weights, Params) else weights and str(weights),
         }
     with contextlib.ExitStack() as exit_stack:
         host_callback = callback if callback and is_first_host() else Callback()
@@ -230,7 +231,7 @@ def _require_usable(
             )
 
 
-def _with_teacher(config: TrainConfig) -> TrainConfig:
+def with_teacher(config: TrainConfig) -> TrainConfig:
     """Return the configuration of a model that states whose descriptors it learns, if there is a teacher.
 
     Raises ValueError if the teacher does not describe the images of the model by as many numbers.

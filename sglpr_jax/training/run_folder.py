@@ -21,7 +21,12 @@ CONFIG_FILE = "config.json"
 ENVIRONMENT_FILE = "environment.json"
 CHECKPOINTS = "checkpoints"
 PACKAGES = ("sglpr-jax", "jax", "jaxlib", "flax", "optax", "numpy")
-REMOVED = {"config.select": "last"}
+REMOVED = {
+    "config.select": "last",
+    "config.loss.closest_positive": True,
+    "config.loss.reduction": "max",
+    "config.optimizer.weight_decay": 0.0,
+}
 """Removed settings, which older runs still have in config.json, and the value that all runs have today."""
 _CHECKOUT = Path(__file__).resolve().parents[2]
 

@@ -56,7 +56,7 @@ def test_a_stopped_node_continues_its_map(town, tmp_path):
     out = tmp_path / "map"
     assert len(read_loops_jsonl(out / "loops.jsonl")) == sum(one["type"] == "loop" for one in found())
     assert len(read_g2o(out / "loops.g2o").poses) == SCANS and not half_written(out)
-    assert [int(path.stem) for path in sorted((out / "scans").iterdir())] == list(range(SCANS))
+    assert [int(path.stem) for path in sorted((out / "cloud-scans").iterdir())] == list(range(SCANS))
     cloud = read_scan(out / "cloud.ply")
     expected = recording.positions - recording.positions[0]
     assert len(cloud) > 1000 and np.linalg.norm(np.ptp(cloud, axis=0)) > np.linalg.norm(np.ptp(expected, axis=0))
@@ -67,6 +67,18 @@ def test_a_cloud_needs_odometry(tmp_path):
     ended = run_command("live", f"folder:{tmp_path}", "--out", tmp_path / "map", "--cloud", tmp_path / "cloud.ply")
     assert ended.status == 1 and "expected --odometry-topic or --poses, found neither" in ended.error
     assert not (tmp_path / "map").exists()
+
+
+@pytest.mark.parametrize(
+    ("source", "flags", "expected"),
+    [
+        ("bag:a.mcap", ("--poses", "a.tum"), "bag:a.mcap: expected odometry by --odometry-topic, found --poses"),
+        ("folder:.", ("--odometry-topic", "/odom"), "folder:.: expected odometry by --poses, found --odometry-topic"),
+    ],
+)
+def test_odometry_of_another_source_is_refused(tmp_path, source, flags, expected):
+    ended = run_command("live", source, *flags, "--out", tmp_path / "map")
+    assert ended.status == 1 and expected in ended.error
 
 
 def test_a_missing_package_is_told_before_anything_is_loaded(tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """bin/reproduce: leave-one-out runs on the small town, and the tables and figures made of them."""
 
 import json
+import shutil
 
 import pytest
 
@@ -79,7 +80,7 @@ def test_table_3_queries_the_later_sessions_and_skips_methods_that_need_labels(r
 
 
 @pytest.mark.slow
-def test_other_settings_are_refused_and_more_steps_continue_a_run(reproduced, command):
+def test_other_settings_are_refused_and_more_steps_continue_a_run(reproduced, command, tmp_path):
     folder, _, options = reproduced
     other = command("reproduce", "table5", *options, "--optimizer.learning-rate", "0.5")
     assert_one_line_error(other, "no-segmentation", "config.optimizer.learning_rate")
@@ -87,6 +88,9 @@ def test_other_settings_are_refused_and_more_steps_continue_a_run(reproduced, co
     more = command("reproduce", "table5", *options, "--steps", 6, "--plan")
     assert more.status == 0 and "0 of them already trained" in more.error
     assert read_metrics(folder / "full" / "08" / "metrics.jsonl")[-1]["step"] == 4  # only said, not done
+    longer = shutil.copytree(folder, tmp_path / "longer")
+    assert command("reproduce", "table5", *options, "--out", longer, "--steps", 6).status == 0
+    assert read_metrics(longer / "full" / "08" / "metrics.jsonl")[-1]["step"] == 6
 
 
 def test_every_variant_differs_from_the_preset_and_from_every_other():

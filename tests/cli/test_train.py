@@ -82,7 +82,7 @@ def test_a_run_is_resumed_with_its_own_settings_only(command, trained, town, pre
 @pytest.mark.slow
 def test_a_run_starts_with_the_weights_of_the_flag(command, trained, images, preset, tmp_path):
     options = ("--data", images, "--preset", preset, "--seq", "06", "--steps", 1, "--method")
-    options = (*options, "--optimizer.learning-rate", "0", "--optimizer.weight-decay", "0")
+    options = (*options, "--optimizer.learning-rate", "0")
     begun = command("train", *options, "--weights", trained.folder, "--out", tmp_path / "run")
     assert begun.status == 0, begun.error
     assert weights_hash(sglpr_jax.load(tmp_path / "run")) == weights_hash(sglpr_jax.load(trained.folder))

@@ -45,8 +45,8 @@ def recording_of(times, clouds, *, field: str = "time", within=WITHIN, **fields)
     """A recording whose points have times."""
     plain = of_scans({Path(f"{i:03d}.bin"): cloud for i, cloud in enumerate(clouds)}, times=times, **fields)
 
-    def read(path, labels, lasers):
-        return dataclasses.replace(plain.read(path, labels, lasers), time_field=TimeField(field, within))
+    def read(path, labels):
+        return dataclasses.replace(plain.read(path, labels), time_field=TimeField(field, within))
 
     return dataclasses.replace(plain, read=read)
 

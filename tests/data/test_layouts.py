@@ -101,6 +101,7 @@ LAYOUTS = {
         POINTS + 1,
         "lidar_poses.csv",
         "format: Boreas, float32x6 (24 bytes a point)",
+        [0, 0, 0],
         part="boreas-2020",
     ),
     "kitti raw": Layout(
@@ -176,7 +177,7 @@ def test_every_layout(tree, layout):
         assert (found.name, found.ids, found.pose_source) == (expected.name, expected.ids, expected.pose_source)
         np.testing.assert_allclose(found.positions, expected.positions, atol=1e-4)
         np.testing.assert_allclose(np.diff(found.times), expected.steps_s, atol=1e-6)
-        scan = found.scan(len(found) - 1, lasers=True)
+        scan = found.scan(len(found) - 1)
         np.testing.assert_allclose(scan.points, expected.points, atol=2e-5)
         assert scan.points.dtype == np.float32
         assert (None if scan.lasers is None else scan.lasers.tolist()) == expected.lasers

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.data.formats.pose_files import read_poses, read_rows, read_times, read_trajectory, rows_of_frames
+from sglpr_jax.data.formats.pose_files import read_kitti, read_rows, read_times, read_trajectory, rows_of_frames
 from sglpr_jax.data.times import PER_SECOND, check_jumps, counts_rows, time_unit_problem, times_of, unit_change
 from sglpr_jax.files import DataWarning
 
@@ -90,7 +90,7 @@ def test_a_malformed_file_is_named(write, name, text, error):
 )
 def test_a_bad_line_is_named(write, line, found):
     with pytest.raises(ValueError, match=rf"poses\.txt{found}"):
-        read_poses(write("poses.txt", KITTI + line + KITTI))
+        read_kitti(write("poses.txt", KITTI + line + KITTI))
 
 
 def test_heights_that_run_as_far_as_a_road_are_told(write, recwarn):

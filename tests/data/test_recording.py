@@ -48,12 +48,11 @@ def test_lasers_come_from_the_read_of_the_points(tmp_path, opened):
     points[:, 4] = np.arange(64) % 32
     points.tofile(tmp_path / "0.bin")
     recording = open_recording(tmp_path, format="nuscenes")
-    scan = recording.scan(0, lasers=True)
+    scan = recording.scan(0)
     assert scan.name == f"scan 0 of sequence {tmp_path.name}"
     np.testing.assert_array_equal(scan.lasers, np.arange(64) % 32)
-    assert recording.scan(0).lasers is None
     opened.clear()
-    left = corrupted(recording, Corruption("beams", 16.0), seed=0).scan(0, lasers=True)
+    left = corrupted(recording, Corruption("beams", 16.0), seed=0).scan(0)
     assert len(left.points) == len(left.lasers) == 32 and opened == {"0.bin": 1}
 
 

@@ -39,10 +39,9 @@ def test_a_bag_is_a_recording(tmp_path, kind):
     np.testing.assert_allclose(recording.times, [100, 100.1, 100.2])
     assert f"/points of {root.name}, x y z ring (14 bytes a point)" in recording.found[0]
     for i in (2, 0, 1):
-        scan = recording.scan(i, lasers=True)
+        scan = recording.scan(i)
         np.testing.assert_array_equal(scan.points, points_of(i))
         np.testing.assert_array_equal(scan.lasers, RINGS)
-    assert recording.scan(0).lasers is None
 
 
 @pytest.mark.parametrize(

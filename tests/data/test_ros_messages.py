@@ -87,6 +87,6 @@ def test_a_bag_of_livox_is_a_recording(tmp_path, kind, driver):
     recording = open_recording(write_bag(tmp_path / FILES[kind], kind, messages), sensor_height=1.0)
     assert "Livox, offset_time x y z reflectivity tag line" in recording.found[0]
     np.testing.assert_allclose(recording.times, [50, 51, 52])
-    scan = recording.scan(2, lasers=True)
+    scan = recording.scan(2)
     np.testing.assert_array_equal(scan.points, clouds[2])
     np.testing.assert_array_equal(scan.lasers, np.arange(24) % 6)

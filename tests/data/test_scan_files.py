@@ -54,7 +54,7 @@ def test_every_format(tmp_path, name):
     content, timed = FILES[name]
     found = read_scan_file(write(tmp_path, name, content))
     np.testing.assert_array_equal(found.points, CLOUD)
-    assert found.points.dtype == np.float32 and found.lasers is None
+    assert found.points.dtype == np.float32 and (found.lasers is None) == (not timed)
     assert (found.time_field is not None) == timed
     if timed:
         assert found.time_field.name == "timestamp"

@@ -45,5 +45,5 @@ def test_scores_equal_those_computed_class_by_class(truth, prediction, counted):
 @pytest.mark.parametrize("label", [0, 1])
 def test_no_counted_cell_is_an_error(label):
     truth = np.full((1, 2, 2), label, np.int32)
-    with pytest.raises(ValueError, match="cells with points and labels, found none"):
+    with pytest.raises(ValueError, match="cells with labels and predicted classes, found none"):
         score(truth, truth, np.full(truth.shape, label == 0))

@@ -15,6 +15,7 @@ from PIL import Image
 from sglpr_jax.data.formats.png import read_label_image
 from sglpr_jax.data.formats.pose_files import Trajectory, read_times, read_trajectory
 from sglpr_jax.data.formats.scan_files import read_labels, read_scan
+from sglpr_jax.data.formats.tensors import hash_of
 from sglpr_jax.data.packed import open_pack, packed
 from sglpr_jax.data.readers import bev_images, open_recording
 from sglpr_jax.data.readers.mulran_helipr_boreas_nclt import read_nclt_poses
@@ -29,7 +30,6 @@ from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.models.backbone_config import SwinConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig, config_from_dict
 from sglpr_jax.models.sglpr import weight_shapes
-from sglpr_jax.models.weights import hash_of
 from sglpr_jax.models.weights_file import CONFIG_FILE, VALUES_HASH, WEIGHTS_FILE, load
 from sglpr_jax.pose_graph import files as loop_files
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile

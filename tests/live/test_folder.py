@@ -93,6 +93,17 @@ def test_poses_of_a_folder_are_those_of_their_line_or_time(incoming, tmp_path, s
     np.testing.assert_allclose(second.odometry, poses[2], atol=1e-6)
 
 
+def test_a_scan_waits_for_a_pose_at_its_time_and_takes_the_last_one_only_if_it_is_late(tmp_path):
+    write_tum(
+        tmp_path / "poses.tum", np.stack([transform(float(i), 0.0, 0.0) for i in range(4)]), STAMP + np.arange(4) / 10
+    )
+    found = GrowingPoses(tmp_path / "poses.tum", "auto", "auto")
+    found.read_appended()
+    assert found.of(0, STAMP + 0.35) is None
+    np.testing.assert_allclose(found.of(0, STAMP + 0.35, is_late=True), transform(3.0, 0.0, 0.0))
+    np.testing.assert_allclose(found.of(0, STAMP + 0.3), transform(3.0, 0.0, 0.0), atol=1e-4)
+
+
 def test_a_file_of_poses_grows_and_a_damaged_line_costs_its_own_scan(tmp_path):
     path = tmp_path / "poses.txt"
     found = GrowingPoses(path, "lidar", "auto")

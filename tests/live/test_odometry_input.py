@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from sglpr_jax.live.odometry_input import (
+    FIRST_ODOMETRY_S,
     HOLD_S,
     MOUNTING_SCANS,
-    WAIT_S,
     FixedMounting,
     OdometryContinuity,
     ScanClock,
@@ -80,7 +80,7 @@ def test_the_first_scans_wait_for_odometry(said):
     continuity = OdometryContinuity(said, expected=True)
     assert placed(continuity, [(5.0, None), (6.0, at(0))]) == [None, True]
     late = OdometryContinuity(said, expected=True)
-    assert placed(late, [(5.0, None), (5.0 + WAIT_S, None), (16.0, at(0))]) == [None, True, True]
+    assert placed(late, [(5.0, None), (5.0 + FIRST_ODOMETRY_S, None), (16.0, at(0))]) == [None, True, True]
     assert late.add(at(0), 17.0).pose is None
     assert said.kinds == ["wait", "wait", "wait over", "odometry", "odometry"]
 

@@ -51,7 +51,8 @@ class Standing:
     def count_publishers(self, topic):
         return topic == "/points"
 
-    def declare_parameter(self, name, value):
+    def declare_parameter(self, name, value, descriptor):
+        assert descriptor.dynamic_typing
         return types.SimpleNamespace(value=value)
 
     def get_logger(self):
@@ -83,6 +84,8 @@ def package(monkeypatch):
             "ok": lambda: bool(running),
             "try_shutdown": running.clear,
         },
+        "rcl_interfaces": {},
+        "rcl_interfaces.msg": {"ParameterDescriptor": types.SimpleNamespace},
         "rclpy.qos": {"QoSProfile": dict, **policies},
         "rclpy.signals": {"SignalHandlerOptions": types.SimpleNamespace(NO="none")},
         "rclpy.executors": {"ExternalShutdownException": RuntimeError},

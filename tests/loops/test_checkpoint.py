@@ -109,7 +109,7 @@ def test_a_damaged_frame_alone_is_described_again_and_other_settings_restart(twi
     content[len(content) // 2] ^= 1
     log.write_bytes(content)
     read, done = [], []
-    counted = with_points(recording, lambda path: read.append(path) or recording.read(path, None, False).points)
+    counted = with_points(recording, lambda path: read.append(path) or recording.read(path, None).points)
     for described in (1 + len(ROWS) - 16, 0):
         read.clear()
         found = find_loops(counted, params, odometry=odometry, **options)
@@ -131,7 +131,7 @@ def test_scans_that_cannot_be_read_are_left_out_and_frames_keep_their_numbers(tw
     def points_of(path):
         if path in broken:
             raise ValueError("expected a whole scan, found half of one")
-        return recording.read(path, None, False).points
+        return recording.read(path, None).points
 
     bad = with_points(recording, points_of)
     options = {"odometry": odometry, "config": CONFIG, "kept_in": tmp_path / "kept"}
@@ -182,7 +182,7 @@ def test_registration_stops_between_loops_and_goes_on(twice, params, tmp_path, m
     (session,) = stopped.sessions
     assert session.frames == 24 and not stopped.whole and session.unregistered == len(overlaps) - 2
     assert str(stopped).endswith(f", {len(overlaps) - 2} not registered")
-    read = with_points(recording, lambda path: asked.append(path) or recording.read(path, None, False).points)
+    read = with_points(recording, lambda path: asked.append(path) or recording.read(path, None).points)
     found = find_loops(read, params, **options)
     assert found.whole and all(loop.overlap == 0.9 for loop in found.loops)
     assert len(asked) == 2 * len(found.loops)  # for their registration: no scan was looked at again

@@ -68,9 +68,9 @@ def test_scans_between_keyframes_are_not_read_and_loops_have_the_numbers_of_scan
         paths = [Path(f"{row:06d}.bin") for row in range(times * len(street))]
         plain = of_scans({path: clouds[row // times] for row, path in enumerate(paths)})
 
-        def read(path, labels, lasers):
+        def read(path, labels):
             reads.append(path)
-            return plain.read(path, labels, lasers)
+            return plain.read(path, labels)
 
         odometry = np.repeat(poses, times, axis=0)
         return find_loops(dataclasses.replace(plain, read=read), params, odometry=odometry, registered=False)

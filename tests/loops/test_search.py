@@ -185,7 +185,7 @@ def test_one_street_on_two_days_has_a_transform_with_and_without_odometry(params
         search, "accept_between", lambda *a, drift: drifts.append(drift) or accept_between(*a, drift=drift)
     )
     find_loops(both, params, odometry=[None, odometry[1]], registered=False)
-    assert drifts == [MOTION_DRIFT]  # that of the recording that drifts more, not of the second one
+    assert drifts == [MOTION_DRIFT]  # the larger one, not that of the second recording
 
 
 @pytest.mark.slow

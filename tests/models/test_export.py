@@ -7,7 +7,6 @@ import json
 import jax
 import jax.export
 import numpy as np
-import onnxruntime
 import pytest
 
 import sglpr_jax
@@ -51,6 +50,8 @@ def test_stablehlo_gives_the_same_descriptors_for_any_number_of_images(params, t
 
 @pytest.mark.slow
 def test_onnx_gives_the_same_descriptors_for_any_number_of_images(params, tmp_path):
+    import onnxruntime  # an extra
+
     save_program(params, tmp_path / "out", format="onnx")
     session = onnxruntime.InferenceSession(tmp_path / "out" / "describe.onnx")
     for n in (1, 3):

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
+from sglpr_jax.data.formats.tensors import hash_of
 from sglpr_jax.models import weights_file
 from sglpr_jax.models.config import model_preset
-from sglpr_jax.models.weights import Params, hash_of, weights_hash
+from sglpr_jax.models.weights import Params, weights_hash
 from sglpr_jax.models.weights_file import CONFIG_FILE, WEIGHTS_FILE, load, save
 
 

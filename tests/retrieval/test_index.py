@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sglpr_jax import Index
-from sglpr_jax.data.formats.tensors import tensors_as_bytes
-from sglpr_jax.retrieval.index import FORMAT, _checksum
+from sglpr_jax.data.formats.tensors import hash_of, tensors_as_bytes
+from sglpr_jax.retrieval.index import FORMAT
 
 from .places import WIDTH, add_places, draw, file_of
 
@@ -130,7 +130,7 @@ def with_checksum(path, arrays=None, **about):
     arrays = {"descriptors": draw(3)} | (arrays or {})
     valid = {"format": FORMAT, "width": WIDTH, "weights_hash": "", "distance": "l2", "ids": ["a", "b", "c"]}
     text = json.dumps(valid | about)
-    path.write_bytes(tensors_as_bytes(arrays, {"about": text, "sha256": _checksum(text, arrays)}))
+    path.write_bytes(tensors_as_bytes(arrays, {"about": text, "sha256": hash_of(arrays, about=text)}))
     return path
 
 

@@ -1,7 +1,6 @@
 """Simulated datasets on disk and on the fly: layouts, the same bytes for the same seed, resumable, whole or missing."""
 
 import dataclasses
-import json
 import shutil
 from pathlib import Path
 
@@ -9,10 +8,10 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.density_image import density_image, density_label_image
+from sglpr_jax.data.formats.pose_files import read_kitti
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.submap import submaps
-from sglpr_jax.se3 import positions_from_camera
 from sglpr_jax.sim import recording
 from sglpr_jax.sim.dataset import simulate
 from sglpr_jax.sim.drive import CARRIERS
@@ -54,7 +53,7 @@ def pose_file(tmp_path) -> Path:
 def test_poses_times_and_calibration_are_kittis(dataset, drive):
     folder = dataset / "sequences" / "08"
     poses = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)
-    np.testing.assert_allclose(positions_from_camera(poses), drive.positions, atol=1e-5)
+    np.testing.assert_allclose(read_kitti(folder / "poses.txt")[:, :3, 3], drive.positions, atol=1e-5)
     np.testing.assert_allclose(np.loadtxt(folder / "times.txt"), drive.times, rtol=1e-5)
     rows = dict(line.split(":") for line in (folder / "calib.txt").read_text().splitlines())
     camera_from_lidar = np.array(rows["Tr"].split(), float).reshape(3, 4)
@@ -163,17 +162,6 @@ def test_other_settings_are_refused(dataset, changes, found):
     assert content(dataset) == before
 
 
-def test_settings_of_earlier_versions_are_read(dataset, tmp_path):
-    old = shutil.copytree(dataset, tmp_path / "old")
-    settings = json.loads((old / "simulation.json").read_text())
-    del settings["carrier"], settings["sensor"]["pattern"]
-    for name in ("crossing_every", "wavelength"):
-        settings["scenery"][name] = settings["scenery"].pop(f"{name}_m")
-    for stored in (settings, {name: value for name, value in settings.items() if name != "scenery"}):
-        (old / "simulation.json").write_text(json.dumps(stored))
-        write(old)
-
-
 def test_files_that_were_not_simulated_are_never_written_among(tmp_path):
     (tmp_path / "sequences" / "00").mkdir(parents=True)
     with pytest.raises(ValueError, match="not simulated"):
@@ -198,6 +186,8 @@ def test_a_drive_aside_shows_the_same_town_from_another_lane(dataset, drive, tmp
     offset = (aside.positions - usual.positions)[:, :2]
     np.testing.assert_allclose(offset, 3.0 * drive.poses.world_from_lidar[:, :2, 1], atol=0.05)  # to the left
     assert len(aside.points(0)) != len(usual.points(0))
+    with pytest.raises(ValueError, match=r"expected aside_m 0\.0 \(found 3\.0\)"):
+        write(tmp_path / "aside", routes=("00",))
 
 
 def test_submaps_of_a_carrier_in_a_scenery_where_places_repeat(tmp_path):
@@ -220,18 +210,16 @@ def test_the_sensor_has_the_height_of_the_scenery(tmp_path, scenery, height_m):
     options = {"routes": ["08"], "scans": 2, "sensor": "vlp16", "azimuth_steps": 200, "scenery": scenery}
     found = simulate(tmp_path, **options)
     assert open_recording(found.root, "08").mounting == Mounting(height_m)
-    settings = json.loads((tmp_path / "simulation.json").read_text())
-    del settings["height_m"]  # as older datasets
-    (tmp_path / "simulation.json").write_text(json.dumps(settings))
-    simulate(tmp_path, **options)
-    assert open_recording(found.root, "08").mounting == Mounting(height_m)
 
 
 def test_the_tilt_of_a_sensor_in_a_hand_is_seen_in_its_scans(tmp_path):
     options = {"routes": ["08"], "scans": 12, "sensor": "vlp16", "azimuth_steps": 400, "carrier": "handheld"}
-    walk = open_recording(simulate(tmp_path, **options).root, "08")
-    assert walk.mountings is not None and "tilts" in " ".join(walk.found)
-    assert "as simulated" not in " ".join(walk.found)
+    root = simulate(tmp_path / "walk", **options).root
+    for walk in (open_recording(root, "08"), open_recording(tmp_path, "walk/08")):
+        assert walk.mountings is not None and "tilts" in " ".join(walk.found)
+        assert "as simulated" not in " ".join(walk.found)
+    stated = open_recording(tmp_path, "walk/08", sensor_height=1.4)
+    assert stated.mountings is None and stated.mounting == Mounting(1.4)
 
 
 @pytest.mark.parametrize(

@@ -6,13 +6,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sglpr_jax.se3 import distances
-from sglpr_jax.sim.drive import CARRIERS, PlanarPath, plan_path, poses_on, read_path, scan_rows, speeds
+from sglpr_jax.sim.drive import CARRIERS, PlanarPath, plan_path, poses_on, read_path, scan_rows
 from sglpr_jax.sim.ground import draw_relief, relief_height
 from sglpr_jax.sim.recording import simulate_repeating
 from sglpr_jax.sim.routes import ROLES, plan_walk
 from sglpr_jax.sim.sensor import Sensor
 
 LEAST = {"00": 0.12, "02": 0.08, "05": 0.12, "06": 0.1, "07": 0.05, "08": 0.1, "09": 0.03}
+
+
+def speeds(path: PlanarPath) -> np.ndarray:
+    """Speed of the vehicle at each pose, in m/s. It is negative where the vehicle reverses."""
+    velocity = np.gradient(path.xy, path.times, axis=0)
+    forward = velocity[:, 0] * np.cos(path.yaw) + velocity[:, 1] * np.sin(path.yaw)
+    return np.where(forward < 0, -1, 1) * np.linalg.norm(velocity, axis=1)
 
 
 def revisits(trajectory) -> tuple[float, float, np.ndarray]:

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from surfaces import NOTHING, pose, random_scene, reference, shapes
 
+from sglpr_jax.sim import raycast
 from sglpr_jax.sim.labels import BUILDING, ROAD, TERRAIN
 from sglpr_jax.sim.raycast import (
     COLUMNS,
@@ -50,8 +51,8 @@ def no_chance(rays: np.ndarray) -> Chance:
     return Chance(np.zeros(rays.shape[:2], np.float32), np.zeros(rays.shape[:2], np.uint32))
 
 
-def candidates_of(scene: Scene, world_from_lidar: np.ndarray, **options):
-    return find_candidates(scene, world_from_lidar, time=0.0, azimuth_steps=STEPS, reach_m=REACH_M, **options)
+def candidates_of(scene: Scene, world_from_lidar: np.ndarray):
+    return find_candidates(scene, world_from_lidar, time=0.0, azimuth_steps=STEPS, reach_m=REACH_M)
 
 
 def cast(scene: Scene, world_from_lidar: np.ndarray, chance: Chance | None = None):
@@ -94,9 +95,10 @@ def test_the_nearest_of_all_shapes_wins_from_any_pose(seed, world_from_lidar):
     assert missed.sum() > 100 and np.all(found[missed] == -1)
 
 
-def test_of_too_many_shapes_in_a_sector_the_nearest_are_kept():
+def test_of_too_many_shapes_in_a_sector_the_nearest_are_kept(monkeypatch):
+    monkeypatch.setattr(raycast, "SLOTS", (4, 4, 4))
     row = shapes(*((5.0 + 2 * i, 0, 0, 0.2, 0.2, 2, 0, i) for i in range(10)))
-    (poles, *_) = candidates_of(Scene(row, NOTHING, NOTHING), pose(), slots=(4, 4, 4))
+    (poles, *_) = candidates_of(Scene(row, NOTHING, NOTHING), pose())
     np.testing.assert_array_equal(poles.label[:, 0], [0, 1, 2, 3])
     np.testing.assert_allclose(poles.nearest[:, 0], [4.8, 6.8, 8.8, 10.8], rtol=1e-6)
     assert np.isinf(poles.nearest[:, 2]).all()

@@ -5,13 +5,12 @@ import pytest
 
 from sglpr_jax.sim import recording as sim_recording
 from sglpr_jax.sim.drive import drive_seed
-from sglpr_jax.sim.ground import relief_height
+from sglpr_jax.sim.ground import relief_height, surface_height
 from sglpr_jax.sim.labels import BUILDING, FENCE, POLE
 from sglpr_jax.sim.placement import HEAD_ROOM_M, distances, footprint_distance
 from sglpr_jax.sim.recording import plan_drive, simulate_repeating
 from sglpr_jax.sim.sceneries import REPEATING
-from sglpr_jax.sim.sceneries.site import STEP_M, build, driven_line, painted_ground
-from sglpr_jax.sim.sceneries.site import Strip as GroundStrip
+from sglpr_jax.sim.sceneries.site import STEP_M, PaintedStrip, build, driven_line, painted_ground
 from sglpr_jax.sim.sensor import Sensor
 from sglpr_jax.sim.shapes import Shapes
 from sglpr_jax.sim.world import Levels
@@ -75,6 +74,10 @@ def test_traffic_on_the_highway_keeps_to_other_lanes():
     boxes = world.scene.boxes
     movers = np.flatnonzero(boxes.velocity.any(axis=1))
     assert len(movers) > 100
+    middle = (boxes.since[movers] + boxes.until[movers])[:, None] / 2
+    ground = surface_height(world.ground, boxes.centre[movers, :2] + boxes.velocity[movers] * middle)
+    above = boxes.centre[movers, 2] - boxes.half[movers, 2] - ground
+    assert above.min() > 0.2 and above.max() < 1.1
     for time, xy in zip(path.times[::20], path.xy[::20], strict=True):
         there = movers[(boxes.since[movers] <= time) & (time < boxes.until[movers])]
         away = xy - (boxes.centre[there, :2] + boxes.velocity[there] * time)
@@ -84,7 +87,7 @@ def test_traffic_on_the_highway_keeps_to_other_lanes():
 
 def test_strips_are_painted_left_of_the_line_and_dashes_with_gaps():
     line = np.stack([np.arange(0, 20, STEP_M), np.zeros(200)], axis=1)
-    ground = painted_ground(1, [GroundStrip(line, 0.0, 2.0, POLE), GroundStrip(line, -2.0, -1.0, 7, 4.0)])
+    ground = painted_ground(1, [PaintedStrip(line, 0.0, 2.0, POLE), PaintedStrip(line, -2.0, -1.0, 7, 4.0)])
     assert np.isclose((ground.label == POLE).sum() / 16, 40, atol=4)
     assert np.isclose((ground.label == 7).sum() / 16, 12, atol=3)
 

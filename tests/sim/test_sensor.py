@@ -70,17 +70,6 @@ def test_the_vehicle_hides_what_is_below_it():
     assert len(plain) - len(points) == 4 * 51
 
 
-def test_motion_distortion_moves_points_by_when_they_were_measured():
-    moving = dataclasses.replace(EXACT, motion_distortion=True)
-    plain, _ = scan(KEY, walled_world(), pose(z=1.73), sensor=EXACT)
-    shifted, _ = scan(KEY, walled_world(), pose(z=1.73), sensor=moving, velocity=np.array([10.0, 0, 0]))
-    azimuth = np.round(np.arctan2(plain[:, 1], plain[:, 0]) / (2 * np.pi) * 60) % 60
-    expected = plain[:, :3] - np.array([10.0, 0, 0]) * (0.1 * (azimuth / 60 - 0.5))[:, None]
-    np.testing.assert_allclose(shifted[:, :3], expected, atol=1e-4)
-    with pytest.raises(ValueError, match="velocity"):
-        scan(KEY, walled_world(), pose(z=1.73), sensor=moving)
-
-
 def test_the_key_alone_decides_the_noise():
     noisy = Sensor(elevations_deg=ELEVATIONS, azimuth_steps=60)
     leafy = walled_world()

@@ -11,7 +11,7 @@ from sglpr_jax.labels import CATEGORIES, to_classes
 from sglpr_jax.sim.dataset import simulate
 from sglpr_jax.sim.drive import plan_path
 from sglpr_jax.sim.recording import plan_sessions
-from sglpr_jax.sim.sensor import NCLT_HEIGHT_M, Sensor
+from sglpr_jax.sim.sensor import Sensor
 
 DAYS = ("2012-01-15", "2012-02-04", "2012-03-17")
 TINY = Sensor(elevations_deg=(10.0, 2.0, -1.0, -3.0, -6.0, -10.0, -14.0, -18.0), azimuth_steps=120, height_m=1.0)
@@ -73,9 +73,9 @@ def test_the_reader_gives_back_the_days(dataset, days):
         on_disk = open_recording(dataset, day.name)
         assert on_disk.ids == day.ids and on_disk.pose_source == f"groundtruth_{day.name}.csv"
         up = day.poses.world_from_lidar[:, :3, 2]
-        np.testing.assert_allclose(on_disk.positions, day.positions - NCLT_HEIGHT_M * up, atol=1e-5)
+        np.testing.assert_allclose(on_disk.positions, day.positions - TINY.height_m * up, atol=1e-5)
         for i in (0, SCANS - 1):
-            lifted = day.points(i) + np.float32([0, 0, NCLT_HEIGHT_M])
+            lifted = day.points(i) + np.float32([0, 0, TINY.height_m])
             np.testing.assert_allclose(on_disk.points(i), lifted, atol=0.00251)
 
 

@@ -11,7 +11,7 @@ from sglpr_jax.sim.streets import (
     SAME_STREET_M,
     Network,
     draw_streets,
-    resample,
+    path_of,
     revisits,
     roundabouts,
 )
@@ -19,7 +19,7 @@ from sglpr_jax.sim.styles import STYLES
 
 
 def streets_of(corners, seed: int = 0, **how):
-    path = resample(*drive(corners, **how))
+    path = path_of(*drive(corners, **how))
     return path, draw_streets(np.random.default_rng(seed), path)
 
 
@@ -32,7 +32,7 @@ def driven_length(streets, path) -> int:
 
 @pytest.mark.parametrize("spacing", [0.2, 0.8, 3.0])
 def test_a_path_has_a_point_a_metre_whatever_the_spacing(spacing):
-    path = resample(*drive(((0, 0), (60, 0), (60, 50)), spacing=spacing))
+    path = path_of(*drive(((0, 0), (60, 0), (60, 50)), spacing=spacing))
     assert np.abs(np.linalg.norm(np.diff(path.xy, axis=0), axis=1) - 1).max() < 0.1
     np.testing.assert_allclose(path.speed[10:-10], 8.0, rtol=0.05)
     np.testing.assert_allclose(path.heading[[5, -5]], [0, np.pi / 2], atol=0.02)
@@ -41,8 +41,8 @@ def test_a_path_has_a_point_a_metre_whatever_the_spacing(spacing):
 def test_standing_still_is_no_way():
     trajectory, times = drive(((0, 0), (60, 0)))
     standing = np.concatenate([trajectory[:30], np.tile(trajectory[29], (50, 1)), trajectory[30:]])
-    path = resample(standing, np.arange(len(standing)) * 0.1)
-    np.testing.assert_allclose(path.xy, resample(trajectory, times).xy, atol=1e-9)
+    path = path_of(standing, np.arange(len(standing)) * 0.1)
+    np.testing.assert_allclose(path.xy, path_of(trajectory, times).xy, atol=1e-9)
     assert np.all(np.diff(path.times) > 0) and np.isfinite(path.heading).all()
     assert path.times[-1] == pytest.approx((len(standing) - 1) * 0.1)
 
@@ -58,7 +58,7 @@ def test_standing_still_is_no_way():
 )
 def test_what_is_no_drive_is_refused(trajectory, times):
     with pytest.raises(ValueError, match="a trajectory needs"):
-        resample(np.array(trajectory, float), np.array(times, float))
+        path_of(np.array(trajectory, float), np.array(times, float))
 
 
 @pytest.mark.parametrize(("corners", "again"), [(LOOP, 110), (THERE_AND_BACK, 150)])
@@ -101,8 +101,8 @@ def test_going_around_a_roundabout_makes_an_island():
     circle = np.concatenate([np.cos(turn), np.sin(turn)], axis=1) * 9
     line = np.concatenate([np.arange(-60, -8)[:, None] * [0.0, 1] + [-0.0, 0], circle, np.stack(
         [np.full(50, -9.0), np.arange(-1, -51, -1.0)], axis=1)])  # fmt: skip
-    path = resample(line, np.arange(len(line)) * 0.2)
+    path = path_of(line, np.arange(len(line)) * 0.2)
     (island,) = roundabouts(path)
     np.testing.assert_allclose(island.centre, 0, atol=1.5)
     assert 3 < island.radius < 7
-    assert roundabouts(resample(*drive(LOOP))) == ()  # crossings are none
+    assert roundabouts(path_of(*drive(LOOP))) == ()  # crossings are none

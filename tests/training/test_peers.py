@@ -86,7 +86,7 @@ def loop(name: str, seed: int, *, scans: int = 60) -> Recording:
     angle = (np.arange(SECTORS) + 0.5) / SECTORS * 2 * np.pi - np.pi
     clouds = np.stack([reach * np.cos(angle), reach * np.sin(angle), 0 * reach], axis=-1).astype(np.float32)
 
-    def read(path, labels, lasers):
+    def read(path, labels):
         return Scan(points=np.repeat(clouds[int(path.stem)], 20, axis=0))
 
     return Recording(

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable
 
 import rclpy
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import ExternalShutdownException
 from rclpy.signals import SignalHandlerOptions
 
@@ -41,7 +42,8 @@ def main() -> None:
     """Run the node until Ctrl-C, SIGTERM or the end of ROS, and write the results. Entry point of `ros2 run`."""
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # ROS would end before the results are written
     node = rclpy.create_node("sglpr")
-    values = {name: node.declare_parameter(name, value).value for name, value in defaults().items()}
+    any_type = ParameterDescriptor(dynamic_typing=True)  # a height is "auto" or a number, and 1 is a drift as 1.0 is
+    values = {name: node.declare_parameter(name, value, any_type).value for name, value in defaults().items()}
     log = node.get_logger()
     report = Reports(log.warning)
     threading.Thread(target=_spin, args=(node,), daemon=True).start()

@@ -28,8 +28,10 @@ class RclpyTransport:
     def subscribe(
         self, topic: str, kinds: Collection[str], receive: Receive, *, depth: int, reliable: bool, latched: bool
     ) -> None:
-        """Receive the messages of a topic that have one of these types. Types that are not installed are left out."""
-        for kind in kinds:
+        """Receive the messages of a topic of the type that is published now, if it is one of these, or else of the
+        first type that is installed. A node can subscribe to one type of a topic only."""
+        published = self.published().get(topic, set())
+        for kind in [kind for kind in kinds if kind in published] or kinds:
             try:
                 message_type = get_message(kind)
             except (ImportError, AttributeError, ValueError):  # such as Livox's, on a robot without one
@@ -37,6 +39,7 @@ class RclpyTransport:
             qos, take = _qos(depth, reliable=reliable, latched=latched), self._callback(topic, kind, receive)
             subscription = self._node.create_subscription(message_type, topic, take, qos, raw=True)
             self._destructors.append(partial(self._node.destroy_subscription, subscription))
+            return
 
     def advertise(self, topic: str, kind: str, *, depth: int, latched: bool) -> Callable[[bytes], None]:
         """Return a function that publishes messages of one type."""

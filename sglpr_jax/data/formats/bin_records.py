@@ -15,7 +15,7 @@ from jaxtyping import Float, Num
 
 from sglpr_jax.data.choices import RecordFormat
 from sglpr_jax.data.formats.clouds import check_points
-from sglpr_jax.data.scan import Scan, TimeField, time_field_of
+from sglpr_jax.data.scan import Scan, TimeField, laser_field_of, time_field_of
 from sglpr_jax.files import naming, warn
 
 NCLT_RECORD = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
@@ -62,7 +62,7 @@ def read_record_file(path: Path, record: np.dtype, *, format: str) -> Scan:
 
     Arguments:
       path: File of the scan.
-      record: Numpy type of one point: "xyz", and perhaps "laser" or "line" and a field of `TIME_FIELDS`.
+      record: Numpy type of one point: "xyz", and perhaps a field of `LASER_FIELDS` and one of `TIME_FIELDS`.
       format: Name of the format, for messages, and for the conversion to metres if `AXES` has one for this format.
     """
     size = path.stat().st_size
@@ -76,7 +76,7 @@ def read_record_file(path: Path, record: np.dtype, *, format: str) -> Scan:
         check_points(size // record.itemsize, bytes_each=record.itemsize)
     points = np.fromfile(path, dtype=record)
     names = record.names or ()
-    laser_field = next((name for name in ("laser", "line") if name in names), None)
+    laser_field = laser_field_of(names)
     time_field = time_field_of(names)
     with np.errstate(over="ignore", invalid="ignore"):  # callers drop invalid coordinates
         xyz = AXES[format](points["xyz"]) if format in AXES else points["xyz"]

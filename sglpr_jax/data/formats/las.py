@@ -12,7 +12,7 @@ from jaxtyping import Float64
 
 from sglpr_jax.data.formats.clouds import BLOCK_POINTS, check_points, cloud_scan
 from sglpr_jax.data.scan import Scan, time_field_of
-from sglpr_jax.extras import install_command
+from sglpr_jax.extras import install_command, optional_module
 from sglpr_jax.files import warn
 
 _RECORD_HEADER, _EXTENDED_RECORD_HEADER = 54, 60
@@ -45,10 +45,7 @@ def las_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
 
 def laspy_module(*, compressed: bool = False) -> ModuleType:
     """Return the module laspy. Raises ImportError if it is not installed, or lazrs, which `compressed` files need."""
-    try:
-        import laspy
-    except ImportError as error:
-        raise ImportError(f".las files need laspy: {install_command('las')}") from error
+    laspy = optional_module("laspy", "reading of .las files", extra="las")
     if compressed and not laspy.LazBackend.detect_available():
         raise ImportError(f".laz files need lazrs: {install_command('las')}")
     return laspy

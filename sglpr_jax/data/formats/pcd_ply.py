@@ -18,7 +18,7 @@ from jaxtyping import Float64
 from sglpr_jax.data.formats import clouds
 from sglpr_jax.data.formats.clouds import check_points, cloud_scan
 from sglpr_jax.data.formats.pose_files import parse_numbers, quaternion_poses
-from sglpr_jax.data.scan import Scan, time_field_of
+from sglpr_jax.data.scan import Scan, laser_field_of, time_field_of
 from sglpr_jax.files import in_short, warn
 from sglpr_jax.se3 import transformed
 
@@ -68,14 +68,15 @@ Parser = Callable[[Content], PointTable]
 
 
 def table_scan(path: Path, *, parse: Parser) -> Scan:
-    """Read the points of a scan in metres, and their times if the file has any. The axes are not changed."""
+    """Read the points of a scan in metres, and their times and lasers if the file has any. The axes are not changed."""
     table = parse(path.read_bytes())
     check_points(table.points, bytes_each=table.row_bytes)
     names = [field.name for field in table.fields if field.count == 1]
-    time = time_field_of([name for name in names if names.count(name) == 1])
+    names = [name for name in names if names.count(name) == 1]
+    time, laser = time_field_of(names), laser_field_of(names)
     decoders = {"binary": _binary_records, "binary_compressed": _compressed_columns, "ascii": _text_columns}
-    columns = decoders[table.encoding](table, AXES if time is None else (*AXES, time))
-    return cloud_scan(columns, time=time)
+    columns = decoders[table.encoding](table, [*AXES, *filter(None, (time, laser))])
+    return cloud_scan(columns, time=time, laser=laser)
 
 
 def table_blocks(path: Path, *, parse: Parser) -> Iterator[Float64[np.ndarray, "_ 3"]]:

@@ -42,10 +42,8 @@ def read_grey_png(path: Path, *, bits: int) -> UInt[np.ndarray, "h w"]:
     return np.rot90(pixels, -1)
 
 
-def image_scan(
-    path: Path, labels: Path | None = None, lasers: bool = False, *, read: Callable[[Path], Float32[np.ndarray, "h w"]]
-) -> Scan:
-    """Read a ready-made image with `read`, and its label image if any, for a `Recording`. `lasers` is ignored."""
+def image_scan(path: Path, labels: Path | None = None, *, read: Callable[[Path], Float32[np.ndarray, "h w"]]) -> Scan:
+    """Read a ready-made image with `read`, and its label image if any, for a `Recording`."""
     image = read(path)
     return Scan(image=image, labels=None if labels is None else read_label_image(labels, shape=image.shape))
 

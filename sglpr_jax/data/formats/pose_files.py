@@ -16,7 +16,7 @@ from sglpr_jax.se3 import are_rotations, from_quaternions, have_unit_length, pos
 
 CAMERA_FROM_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 """Transform from LiDAR axes (x forward, y left, z up) to camera axes (x right, y down, z forward), same origin."""
-FARTHEST_M = 1e8
+FARTHEST_POSITION_M = 1e8
 """Maximum absolute coordinate of a position, in metres."""
 MAX_HEIGHT_RANGE_M = 100.0
 """Maximum range of heights in metres. A larger range is accepted if both horizontal ranges exceed it."""
@@ -29,23 +29,12 @@ TIME_COLUMNS_S = ("t_s", "time_s", "timestamp_s", "seconds")
 """Names with a unit. They are used if the file has no column named in `TIME_COLUMNS`."""
 
 
-def read_poses(path: Path) -> Float[np.ndarray, "n 3 4"]:
-    """Return the poses (n, 3, 4) of a file with 12 numbers a line: rotation and translation in metres, row-major."""
-    poses = read_rows(path, columns=12).reshape(-1, 3, 4)
-    invalid_rows = np.flatnonzero(~are_rotations(poses[:, :, :3]))
-    if invalid_rows.size:
-        found = " ".join(f"{value:g}" for value in poses[invalid_rows[0]].ravel())
-        raise ValueError(f"{path}: expected a rotation and a translation in row {invalid_rows[0] + 1}, found {found}")
-    check_positions(path, poses[:, :, 3])
-    return poses
-
-
 def check_positions(path: Path, positions: Float[np.ndarray, "n 3"]) -> None:
-    """Raise ValueError, with the row in `path`, if a coordinate exceeds `FARTHEST_M` (1e8 m)."""
-    far_rows = np.flatnonzero(np.abs(positions).max(axis=1, initial=0) > FARTHEST_M)
+    """Raise ValueError, with the row in `path`, if a coordinate exceeds `FARTHEST_POSITION_M` (1e8 m)."""
+    far_rows = np.flatnonzero(np.abs(positions).max(axis=1, initial=0) > FARTHEST_POSITION_M)
     if far_rows.size:
         found = f"{positions[far_rows[0]].tolist()} in row {far_rows[0] + 1}"
-        raise ValueError(f"{path}: expected positions in metres, up to {FARTHEST_M:g}, found {found}")
+        raise ValueError(f"{path}: expected positions in metres, up to {FARTHEST_POSITION_M:g}, found {found}")
 
 
 def quaternion_poses(
@@ -80,7 +69,12 @@ def read_tum(
 
 def read_kitti(path: Path, *, camera: bool = True) -> Float[np.ndarray, "n 4 4"]:
     """Read poses from 12 numbers a line, in KITTI's camera axes (converted to z up) or, with `camera=False`, z up."""
-    matrices = read_poses(path)
+    matrices = read_rows(path, columns=12).reshape(-1, 3, 4)
+    invalid_rows = np.flatnonzero(~are_rotations(matrices[:, :, :3]))
+    if invalid_rows.size:
+        found = " ".join(f"{value:g}" for value in matrices[invalid_rows[0]].ravel())
+        raise ValueError(f"{path}: expected a rotation and a translation in row {invalid_rows[0] + 1}, found {found}")
+    check_positions(path, matrices[:, :, 3])
     poses = poses_of(matrices[:, :, 3], matrices[:, :, :3])
     return CAMERA_FROM_LIDAR.T @ poses @ CAMERA_FROM_LIDAR if camera else poses
 

@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Float, Int64, UInt8
 
 from sglpr_jax.data.formats.clouds import check_points, cloud_scan
-from sglpr_jax.data.formats.pose_files import FARTHEST_M
+from sglpr_jax.data.formats.pose_files import FARTHEST_POSITION_M
 from sglpr_jax.data.imu import Imu
 from sglpr_jax.data.poses import LEAST_SHARE, have_poses
-from sglpr_jax.data.scan import TIME_FIELDS, Scan, time_field_of
+from sglpr_jax.data.scan import LASER_FIELDS, TIME_FIELDS, Scan, laser_field_of, time_field_of
 from sglpr_jax.data.times import time_unit_problem
 from sglpr_jax.files import warn
 from sglpr_jax.se3 import from_quaternions, have_unit_length, poses_of
@@ -26,8 +26,6 @@ _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"
 """Numpy types by the number `datatype` of sensor_msgs/PointField."""
 _LEAST_M, _MOST_M = 1e-3, 1e4
 """Range of most nonzero coordinates, in metres. Numbers in the other byte order are spread over 10**-38 to 10**38."""
-_LASERS = ("ring", "channel", "line", "laser_id", "laser")
-"""Field names that drivers use for the laser number of a point."""
 CUSTOM_MSG = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
 """Message types of Livox scans."""
 LIVOX_FIELDS = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
@@ -102,8 +100,7 @@ def read_point_cloud2(message: Any, *, name: str = "cloud") -> Scan:
             warn(f"{name}: expected big-endian points, as is_bigendian states, found little-endian points")
             points = swapped
     names = points.dtype.names or ()
-    laser = next((field for field in _LASERS if field in names), None)
-    return cloud_scan(points, time=time_field_of(names), laser=laser)
+    return cloud_scan(points, time=time_field_of(names), laser=laser_field_of(names))
 
 
 def _point_bytes(message: Any) -> UInt8[np.ndarray, " n"]:
@@ -130,7 +127,7 @@ def _point_type(message: Any, byte_order: str) -> np.dtype:
     fields = {field.name: field for field in message.fields}
     if not {"x", "y", "z"} <= set(fields):
         raise ValueError(f"expected the fields x, y and z, found {' '.join(fields) or 'none'}")
-    names = [name for name in ("x", "y", "z", *_LASERS) if name in fields]
+    names = [name for name in ("x", "y", "z", *LASER_FIELDS) if name in fields]
     names += [name for name in TIME_FIELDS if name in fields and fields[name].datatype in _TYPES]
     datatypes = [fields[name].datatype for name in names]
     if not set(datatypes) <= set(_TYPES):
@@ -169,7 +166,7 @@ class StampedPose(NamedTuple):
     @property
     def is_valid(self) -> bool:
         """Whether the position is on the Earth, and the quaternion has length 1. Some drivers begin with zeros."""
-        is_on_earth = bool((np.abs(self.numbers[:3]) <= FARTHEST_M).all())  # False for NaN
+        is_on_earth = bool((np.abs(self.numbers[:3]) <= FARTHEST_POSITION_M).all())  # False for NaN
         return is_on_earth and bool(have_unit_length(self.numbers[None, 3:]).all())
 
 
@@ -237,13 +234,14 @@ class Track:
 
     @classmethod
     def of(cls, messages: Iterable[tuple[int, StampedPose]]) -> "Track":
-        """Create a track from a recorder time (ns) and a pose for each message. Drops poses with non-finite positions.
+        """Create a track from a recorder time (ns) and a pose for each message.
 
-        If most poses have a rotation (a quaternion of length 1), poses without a rotation are dropped, too.
+        Poses whose position is not on the Earth are dropped. If most poses have a rotation (a quaternion of length 1),
+        poses without a rotation are dropped, too.
         """
         pairs = list(messages)
         numbers = np.array([pose.numbers for _, pose in pairs], np.float64).reshape(-1, 7)
-        has_position = np.isfinite(numbers[:, :3]).all(axis=1)
+        has_position = (np.abs(numbers[:, :3]) <= FARTHEST_POSITION_M).all(axis=1)  # False for NaN
         has_rotation = has_position & have_unit_length(numbers[:, 3:])
         rows = np.flatnonzero(has_rotation if 2 * has_rotation.sum() > has_position.sum() else has_position)
         kept = [pairs[row] for row in rows]

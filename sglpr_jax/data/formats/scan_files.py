@@ -171,14 +171,13 @@ def read_scan_file(path: Path, *, format: ScanFormat = "auto", records: RecordFo
 def scan_of_file(
     path: Path,
     labels: Path | None = None,
-    lasers: bool = False,
     *,
     format: ScanFormat = "auto",
     records: RecordFormat = "kitti",
 ) -> Scan:
     """Read a scan, and the labels of its points if `labels` is given. This is the `Recording.read` of scan files.
 
-    `format` and `records` are those of `read_scan_file`. `lasers` is ignored: laser numbers are always read.
+    `format` and `records` are those of `read_scan_file`.
     """
     scan = read_scan_file(path, format=format, records=records)
     if labels is None:

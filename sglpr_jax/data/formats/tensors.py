@@ -1,7 +1,9 @@
-"""Writes safetensors files reproducibly: equal arrays and metadata give equal bytes."""
+"""Safetensors files, written reproducibly: equal arrays and metadata give equal bytes. Hashes of arrays."""
 
+import hashlib
 import json
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import safetensors.numpy
@@ -20,3 +22,12 @@ def tensors_as_bytes(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, st
     header_bytes = json.dumps(header, separators=(",", ":")).encode()
     header_bytes += b" " * (-len(header_bytes) % 8)  # the arrays after the header are aligned to 8 bytes
     return b"".join([len(header_bytes).to_bytes(8, "little"), header_bytes, memoryview(content)[end:]])
+
+
+def hash_of(named: Mapping[str, Any], *, about: str = "") -> str:
+    """Return the SHA-256 of a text and of names, shapes, types and values of arrays, in the order of their names."""
+    digest = hashlib.sha256(about.encode())
+    for name, array in sorted(named.items()):
+        digest.update(f"{name} {array.shape} {array.dtype}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()

@@ -35,7 +35,7 @@ def recording_names(root: Path | str) -> tuple[str, ...]:
 
     Raises FileNotFoundError, with the supported layouts, for another folder, and ValueError if a table is malformed.
     """
-    return _find_reader(Path(root))[1]
+    return find_reader(Path(root))[1]
 
 
 def open_recording(
@@ -80,7 +80,7 @@ def open_recording(
       recording = open_recording("KITTI", "08")
     """
     root = Path(root)
-    reader, names = _find_reader(root)
+    reader, names = find_reader(root)
     if name is None and len(names) == 1:
         name = names[0]
     if name is None or name not in names:
@@ -109,11 +109,12 @@ def open_recording(
     if recording.times is not None:
         check_order(recording.times, source=f"{root}, sequence {name}")
         check_jumps(recording.times, source=f"{root}, sequence {name}")
-    is_known = reader.knows_mounting and not is_in_a_hand(root)
+    dataset = root / name.rpartition("/")[0]  # a recording in a folder of datasets is called DATASET/NAME
+    is_known = reader.knows_mounting and not is_in_a_hand(dataset)
     return mounted(recording, sensor_height, gravity=gravity, known=is_known)
 
 
-def _find_reader(root: Path) -> tuple[Reader, tuple[str, ...]]:
+def find_reader(root: Path) -> tuple[Reader, tuple[str, ...]]:
     """Return the first reader that finds recordings in `root`, and their names, or raise FileNotFoundError."""
     for reader in readers():
         if names := reader.recording_names(root):

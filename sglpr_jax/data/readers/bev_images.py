@@ -13,7 +13,7 @@ from jaxtyping import Float32
 
 from sglpr_jax.data.density_image import as_counts
 from sglpr_jax.data.formats.png import image_scan, read_grey_png
-from sglpr_jax.data.formats.pose_files import read_poses, rows_of_frames
+from sglpr_jax.data.formats.pose_files import read_kitti, rows_of_frames
 from sglpr_jax.data.readers.listing import files_in, names_of, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
@@ -29,7 +29,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     pose_file = folder / "pose.txt"
     positions = None
     if pose_file.is_file():
-        positions = rows_of_frames(read_poses(pose_file), ids, path=pose_file)[:, :, 3]
+        positions = rows_of_frames(read_kitti(pose_file, camera=False), ids, path=pose_file)[:, :3, 3]
     return Recording(
         name=name,
         ids=ids,

@@ -71,9 +71,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     return recording if has_points.all() else only(recording, np.flatnonzero(has_points).tolist())
 
 
-def _read(
-    path: Path, labels: Path | None, lasers: bool, *, cloud: TiledCloud, world_from_lidar: Float[np.ndarray, "n 4 4"]
-) -> Scan:
+def _read(path: Path, labels: Path | None, *, cloud: TiledCloud, world_from_lidar: Float[np.ndarray, "n 4 4"]) -> Scan:
     """Compute the scan of a pose for a `Recording`. `path` is its id, which is the row of the pose."""
     points = _points_at(cloud, world_from_lidar[int(path.name)])
     return Scan(points=remove_hidden_points(points, spacing_m=cloud.spacing_m, reach_m=REACH_M))

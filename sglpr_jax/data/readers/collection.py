@@ -3,9 +3,9 @@
 import dataclasses
 from pathlib import Path
 
-from sglpr_jax.data.readers import open_recording, recording_names
+from sglpr_jax.data.readers import find_reader, recording_names
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
-from sglpr_jax.data.readers.simulation import SIMULATION
+from sglpr_jax.data.readers.simulation import SIMULATION, simulated_world
 from sglpr_jax.data.recording import Recording
 
 
@@ -17,8 +17,8 @@ def _names(root: Path) -> tuple[str, ...]:
 
 def _open(root: Path, name: str, options: ReadOptions) -> Recording:
     dataset, _, inner_name = name.partition("/")
-    recording = open_recording(root / dataset, inner_name, pose_source=options.pose_source, format=options.format)
-    return dataclasses.replace(recording, name=name)
+    recording = find_reader(root / dataset)[0].open(root / dataset, inner_name, options)  # the caller adds the mounting
+    return dataclasses.replace(recording, name=name, world=simulated_world(root / dataset, inner_name))
 
 
 READER = Reader(f"DATASET/{SIMULATION} (datasets of bin/simulate)", _names, _open)

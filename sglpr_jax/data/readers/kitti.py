@@ -15,13 +15,12 @@ from pathlib import Path
 
 from sglpr_jax.data.choices import PoseChoice, ScanFormat
 from sglpr_jax.data.formats.bin_records import describe_format, detect_format_unless_kitti
-from sglpr_jax.data.formats.pose_files import read_poses, read_times, rows_of_frames
+from sglpr_jax.data.formats.pose_files import read_kitti, read_times, rows_of_frames
 from sglpr_jax.data.formats.scan_files import scan_of_file
 from sglpr_jax.data.readers.listing import files_in, names_of, scans_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.readers.simulation import simulated_mounting
-from sglpr_jax.data.recording import ReadRecord, Recording
-from sglpr_jax.se3 import positions_from_camera
+from sglpr_jax.data.recording import ReadScan, Recording
 
 
 def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
@@ -32,8 +31,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     pose_file = _choose_pose_file(root, name, options.pose_source)
     positions = None
     if pose_file is not None:
-        all_positions = positions_from_camera(read_poses(root / pose_file))
-        positions = rows_of_frames(all_positions, ids, path=root / pose_file)
+        positions = rows_of_frames(read_kitti(root / pose_file), ids, path=root / pose_file)[:, :3, 3]
     times_file = folder / "times.txt"
     times = read_times(times_file, unit=options.time_unit) if times_file.is_file() else None
     labels = {path.stem: path for path in files_in(folder / "labels", ".label")}
@@ -53,7 +51,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     )
 
 
-def _scan_reader(paths: tuple[Path, ...], format: ScanFormat) -> tuple[ReadRecord, str]:
+def _scan_reader(paths: tuple[Path, ...], format: ScanFormat) -> tuple[ReadScan, str]:
     """Return a function that reads a scan of the sequence, and a description of the format."""
     if format != "auto":
         return partial(scan_of_file, format=format), f"{format}, as given"

@@ -222,7 +222,7 @@ def open_recording(root: Path, name: str, options: ReadOptions, *, layouts: tupl
         name=name,
         ids=tuple(paths[row].stem for row in scan_rows),
         paths=tuple(paths[row] for row in scan_rows),
-        read=lambda path, labels, lasers: layout.read_scan(path),
+        read=lambda path, labels: layout.read_scan(path),
         positions=positions[pose_rows[scan_rows]],
         times=scan_times[scan_rows] * layout.time_unit_s,
         pose_source=f"{pose_file.name}{left_out}",

@@ -79,9 +79,7 @@ def _read_times(path: Path) -> Float[np.ndarray, " n"]:
     return times
 
 
-def _read(
-    path: Path, labels: Path | None, lasers: bool, *, poses: dict[Path, Float[np.ndarray, "4 4"]], poses_hash: str
-) -> Scan:
+def _read(path: Path, labels: Path | None, *, poses: dict[Path, Float[np.ndarray, "4 4"]], poses_hash: str) -> Scan:
     """Read a scan for a `Recording`, transformed from the world to the LiDAR frame with x forward."""
     world_from_lidar = poses[path]  # `poses_hash` is only for caches, which compare the arguments of this function
     in_lidar = (read_scan(path, format="npy") - world_from_lidar[:3, 3]) @ world_from_lidar[:3, :3]

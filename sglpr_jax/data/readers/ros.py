@@ -82,7 +82,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
 
 
 def _read(
-    path: Path, labels: Path | None, lasers: bool, *, bag: RosBag, topic: str, time_and_nth: dict[str, tuple[int, int]]
+    path: Path, labels: Path | None, *, bag: RosBag, topic: str, time_and_nth: dict[str, tuple[int, int]]
 ) -> Scan:
     """Read a scan for a `Recording`. `path` is its id; bags have no labels, and laser numbers are always read."""
     recorder_ns, nth = time_and_nth[path.name]
@@ -144,7 +144,7 @@ def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | N
         return recording
     track, rows = tracks[used], np.flatnonzero(has_pose[used])
     if track.dropped:
-        found = f"{track.dropped} of {len(track) + track.dropped} without finite position or without rotation"
+        found = f"{track.dropped} of {len(track) + track.dropped} without a position on the Earth or without rotation"
         warn(f"{bag.paths[0]}: expected valid poses on {used}, found {found}; these are dropped")
     pose_times, scan_times = times[used]
     world_from_child = interpolate_poses(pose_times, track.poses, scan_times[rows])

@@ -5,7 +5,6 @@
 - `my_scans/times.txt`: timestamps, one number a line, in seconds unless `time_unit` names another unit.
 """
 
-from collections import Counter
 from functools import partial
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from sglpr_jax.data.formats.scan_files import (
     warn_of_doubts,
 )
 from sglpr_jax.data.poses import poses_at_scans
-from sglpr_jax.data.readers.listing import describe_contents, files_in, scans_in
+from sglpr_jax.data.readers.listing import describe_contents, files_in
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
 
@@ -43,18 +42,16 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
 
     Raises ValueError if two files differ only by their ending, or if the format of the .bin files cannot be detected.
     """
-    paths = _scan_files(root) or scans_in(root, *ENDINGS, *ARRAY_ENDINGS)
+    paths = _scan_files(root)
     path_by_id: dict[str, Path] = {}
     for path in paths:
         first = path_by_id.setdefault(scan_id(path), path)
         if first is not path:
             raise ValueError(f"{root}: expected one file for each scan, found {first.name} and {path.name}")
     ids = tuple(path_by_id)
-    positions, times, source = _read_trajectory(root, len(paths), options)
+    positions, times, source = _read_trajectory(root, ids, options)
     records, format_description = _bin_format(paths, options.format)
     unused = describe_contents(root, without=[*paths, *(root / name for name in (*POSE_FILES, TIMES_FILE))])
-    if positions is not None:
-        warn_of_jumps(positions, ids, path=options.poses or root / str(source))
     return Recording(
         name=root.resolve().name,
         ids=ids,
@@ -73,9 +70,10 @@ def _scan_files(root: Path) -> tuple[Path, ...]:
 
 
 def _read_trajectory(
-    root: Path, scans: int, options: ReadOptions
+    root: Path, ids: tuple[str, ...], options: ReadOptions
 ) -> tuple[Float[np.ndarray, "n 3"] | None, Float[np.ndarray, " n"] | None, str | None]:
     """Return positions (m) and times (s) of the scans and the source of the poses, each None if there is no file."""
+    scans = len(ids)
     files_in_root = [root / name for name in POSE_FILES if (root / name).is_file()]
     if options.poses is None and len(files_in_root) > 1:
         raise ValueError(f"{root}: expected one pose file, found {', '.join(path.name for path in files_in_root)}")
@@ -98,6 +96,7 @@ def _read_trajectory(
             f"{pose_file}: expected poses at the times of all {scans} scans, found none for {len(uncovered)}, the first"
             f" at {uncovered[0]:.1f} s; remove these scans, or pass the poses only to bin/evaluate, which skips them"
         )
+    warn_of_jumps(poses[:, :3, 3], ids, path=pose_file)
     source = trajectory.source if options.poses is not None else pose_file.name
     scan_times = trajectory.times if times is None else times
     return poses[:, :3, 3], scan_times, f"{source}, {how}" if how else source
@@ -108,20 +107,18 @@ def _bin_format(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordForm
     if format != "auto":
         warn_of_doubts(paths, format)
         return "kitti", describe_format(format)  # all files have the given format, so "kitti" is not used
-    formats: list[ScanFormat | None] = [format_by_name(path) for path in paths]
-    unknown = [path for path, name in zip(paths, formats, strict=True) if name is None]
+    unknown = [path for path in paths if format_by_name(path) is None]
     detected, how = detect_point_format(unknown) if unknown else (None, "")
     bin_format: RecordFormat = detected or "kitti"
-    counts = Counter(name or bin_format for name in formats)
     paths_by_format: dict[ScanFormat, list[Path]] = {}
-    for path, name in zip(paths, formats, strict=True):
-        if name is not None:
-            paths_by_format.setdefault(name, []).append(path)
+    for path in paths:
+        paths_by_format.setdefault(format_by_name(path) or bin_format, []).append(path)
     for name, of_format in paths_by_format.items():
-        warn_of_doubts(of_format, name)
-    description = ", ".join(f"{count} {describe_format(name)}" for name, count in counts.items())
-    if len(counts) == 1:
-        description = describe_format(next(iter(counts)))
+        if name != bin_format:  # the format of `unknown` comes from their content
+            warn_of_doubts(of_format, name)
+    description = ", ".join(f"{len(of_format)} {describe_format(name)}" for name, of_format in paths_by_format.items())
+    if len(paths_by_format) == 1:
+        description = describe_format(next(iter(paths_by_format)))
     return bin_format, f"{description}, {how}" if unknown else description
 
 

@@ -13,12 +13,13 @@ import jax
 import numpy as np
 from jaxtyping import Float32, Shaped
 
+from sglpr_jax.data.formats.tensors import hash_of
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import read_json
 from sglpr_jax.methods.learned.method import LearnedMethod, Variables
 from sglpr_jax.methods.method import DistanceFn, check_descriptors
 from sglpr_jax.methods.pairwise import in_blocks, l2
-from sglpr_jax.models.weights import as_tree, by_name, hash_of
+from sglpr_jax.models.weights import as_tree, by_name
 from sglpr_jax.models.weights_file import (
     CONFIG_FILE,
     WEIGHTS_FILE,

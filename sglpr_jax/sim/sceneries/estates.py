@@ -12,8 +12,8 @@ from sglpr_jax.sim.placement import Spot
 from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.sceneries.site import (
     STEP_M,
+    PaintedStrip,
     Site,
-    Strip,
     along,
     grid,
     jittered,
@@ -31,7 +31,9 @@ LAWN_M = 6.0  # minimum distance of a building of the campus from the middle of 
 
 def _street(line: Line, walk_m: float, relief: Relief) -> Ground:
     """Ground of a street along a line, with sidewalks up to `walk_m` metres from it."""
-    return painted_ground(TERRAIN, [Strip(line, -walk_m, walk_m, SIDEWALK), Strip(line, -ROAD_M, ROAD_M, ROAD)], relief)
+    return painted_ground(
+        TERRAIN, [PaintedStrip(line, -walk_m, walk_m, SIDEWALK), PaintedStrip(line, -ROAD_M, ROAD_M, ROAD)], relief
+    )
 
 
 def row_houses(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
@@ -133,7 +135,7 @@ def campus(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     xs, ys = np.arange(min_x, max_x, STEP_M), np.arange(min_y, max_y, STEP_M)
     path_lines = [np.stack([xs, np.full(len(xs), y)], axis=1) for y in np.arange(min_y, max_y + 1, pitch)]
     path_lines += [np.stack([np.full(len(ys), x), ys], axis=1) for x in np.arange(min_x, max_x + 1, pitch)]
-    paths = [Strip(path_line, -1.8, 1.8, SIDEWALK) for path_line in path_lines]
+    paths = [PaintedStrip(path_line, -1.8, 1.8, SIDEWALK) for path_line in path_lines]
     return Site(line, spots, painted_ground(TERRAIN, paths, rolling(rng)))
 
 

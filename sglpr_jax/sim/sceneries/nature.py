@@ -1,6 +1,5 @@
 """Open land and woods: a field with few objects, and a forest."""
 
-import dataclasses
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -12,7 +11,6 @@ from sglpr_jax.sim.objects import ObjectModel, Range, ball, bush, garage, post, 
 from sglpr_jax.sim.placement import Spot
 from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.sceneries.site import STEP_M, Site, along, road, rolling, rounded, track
-from sglpr_jax.sim.styles import TOWN
 
 WIDE_M = 38.0  # half width of the forest on both sides of the path, in metres
 BEND_M = 25.0  # distance between two bends of the path through the forest, in metres
@@ -53,7 +51,7 @@ def forest(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     spots = [Spot(_tree(rng, thickness, crown_bottom), x, y) for x, y in _scattered(rng, line, density)]
     for x, y in _scattered(rng, line, bushes_per_tree * density):
         spots.append(Spot(bush(rng), x, y, rng.uniform(0, 2 * np.pi)))
-    relief = draw_relief(rng, dataclasses.replace(TOWN, steepest=0.12, wavelength_m=(40.0, 200.0)))
+    relief = draw_relief(rng, steepest=0.12, wavelength_m=(40.0, 200.0))
     return Site(line, spots, track(line, 0.6, relief))
 
 

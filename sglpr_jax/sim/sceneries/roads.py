@@ -15,9 +15,9 @@ from sglpr_jax.sim.labels import (
     TRAFFIC_SIGN,
 )
 from sglpr_jax.sim.objects import ObjectModel, block, car, moving, post, truck, van
-from sglpr_jax.sim.placement import Spot
+from sglpr_jax.sim.placement import Spot, moving_spots
 from sglpr_jax.sim.routes import Line
-from sglpr_jax.sim.sceneries.site import STEP_M, Site, Strip, along, mirrored, painted_ground, road, rolling
+from sglpr_jax.sim.sceneries.site import STEP_M, PaintedStrip, Site, along, mirrored, painted_ground, road, rolling
 
 OVERLAP = 1.25  # length of a piece of wall divided by the spacing, because outer walls of curves are longer
 LANE_M = 3.5  # width of the four lanes of a highway, in metres; the vehicle uses the inner ones
@@ -65,9 +65,9 @@ def bridge(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     things.append((mirrored(lamp) if rng.random() < 0.5 else (lamp,), lamps_m))
     legs = mirrored(block(BUILDING, 2.5, 2.0, 30.0, y=half + 1.8))
     things.append(((*legs, block(BUILDING, 1.5, 2 * half + 2, 2.0, bottom=6.5)), pylons_m))
-    lines = [Strip(road_line, 0.0, 0.2, LANE_MARKING, dash_m=4.0)]
-    lines += [Strip(road_line, y, y + 0.2, LANE_MARKING) for y in (-3.6, 3.4)]
-    deck = Strip(road_line, -half - 0.3, half + 0.3, ROAD)
+    lines = [PaintedStrip(road_line, 0.0, 0.2, LANE_MARKING, dash_m=4.0)]
+    lines += [PaintedStrip(road_line, y, y + 0.2, LANE_MARKING) for y in (-3.6, 3.4)]
+    deck = PaintedStrip(road_line, -half - 0.3, half + 0.3, ROAD)
     return Site(path, along(road_line, *things), painted_ground(NO_RETURN, [deck, *lines]))
 
 
@@ -84,9 +84,9 @@ def highway(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     gantry = (*mirrored(post(POLE, 0.4, 6.5, y=rail_y + 0.8)), sign)
     lamps_m, gantries_m = rng.uniform(30, 60), rng.uniform(120, 250)
     spots = along(road_line, (walls, panel_m), (rails, 4.0), (lamps, lamps_m), (gantry, gantries_m))
-    lines = [Strip(road_line, y, y + 0.2, LANE_MARKING, dash_m=4.0) for y in (-LANE_M, 0.0, LANE_M)]
-    edges = [Strip(road_line, y, y + 0.2, LANE_MARKING) for y in (-2 * LANE_M, 2 * LANE_M)]
-    ground = painted_ground(TERRAIN, [Strip(road_line, -rail_y, rail_y, ROAD), *lines, *edges], rolling(rng))
+    lines = [PaintedStrip(road_line, y, y + 0.2, LANE_MARKING, dash_m=4.0) for y in (-LANE_M, 0.0, LANE_M)]
+    edges = [PaintedStrip(road_line, y, y + 0.2, LANE_MARKING) for y in (-2 * LANE_M, 2 * LANE_M)]
+    ground = painted_ground(TERRAIN, [PaintedStrip(road_line, -rail_y, rail_y, ROAD), *lines, *edges], rolling(rng))
     return Site(path, [*spots, *_traffic(rng, road_line, 1), *_traffic(rng, road_line, -1)], ground)
 
 
@@ -106,12 +106,6 @@ def _traffic(rng: np.random.Generator, line: Line, direction: int) -> list[Spot]
 def _drive(thing: ObjectModel, lane: Line, start_s: float, speed: float) -> list[Spot]:
     """Drive of `thing` along the whole lane, as pieces of straight motion of 1.5 s."""
     times = np.arange(start_s, start_s + len(lane) * STEP_M / speed, 1.5)
-    rows = ((times - start_s) * speed / STEP_M).astype(int).clip(0, len(lane) - 1)
-    velocity = np.diff(lane[rows], axis=0) / 1.5
-    xy_at_0 = lane[rows[:-1]] - velocity * times[:-1, None]  # spots hold positions at time 0
-    headings = np.arctan2(*velocity.T[::-1])
-    pieces = np.column_stack([xy_at_0, headings, velocity, times[:-1], times[1:]]).tolist()
-    return [
-        Spot(thing, x, y, heading, velocity=(vx, vy), since=since, until=until)
-        for x, y, heading, vx, vy, since, until in pieces
-    ]
+    xy = lane[((times - start_s) * speed / STEP_M).astype(int).clip(0, len(lane) - 1)]
+    headings = np.arctan2(*np.diff(xy, axis=0).T[::-1])
+    return moving_spots(thing, xy[:-1], xy[1:], headings, times[:-1], times[1:])

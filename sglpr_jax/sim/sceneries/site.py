@@ -1,6 +1,5 @@
 """Elements of a scenery: lines, objects along them and in rows, walls and ground, and construction of the world."""
 
-import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
@@ -15,8 +14,7 @@ from sglpr_jax.sim.ground import CELL_M, Ground, Relief, draw_relief
 from sglpr_jax.sim.labels import BUILDING, OTHER_GROUND, TERRAIN
 from sglpr_jax.sim.objects import ObjectModel, Primitive, block
 from sglpr_jax.sim.placement import HEAD_ROOM_M, Spot, distances, place, to_scene
-from sglpr_jax.sim.routes import Line, Revisit, resampled, travelled
-from sglpr_jax.sim.styles import TOWN
+from sglpr_jax.sim.routes import Line, Revisit, lengths_along, resampled
 from sglpr_jax.sim.world import Levels, World
 
 STEP_M = 0.1  # distance between two points of a line, in metres
@@ -38,7 +36,7 @@ class Site(NamedTuple):
     returns: bool = False  # whether `line` has revisits in the same direction, so that it needs no second lap
 
 
-class Strip(NamedTuple):
+class PaintedStrip(NamedTuple):
     """Strip of ground between two distances to the left of a line, in metres."""
 
     line: Line
@@ -97,10 +95,10 @@ def jittered(rng: np.random.Generator, spots: list[Spot], metres: float, *, keep
 
 def rolling(rng: np.random.Generator) -> Relief:
     """Gentle hills with slopes of at most 1.5 %."""
-    return draw_relief(rng, dataclasses.replace(TOWN, steepest=0.015))
+    return draw_relief(rng, steepest=0.015)
 
 
-def painted_ground(base: int, strips: Sequence[Strip] = (), relief: Relief = FLAT) -> Ground:
+def painted_ground(base: int, strips: Sequence[PaintedStrip] = (), relief: Relief = FLAT) -> Ground:
     """Ground of label `base` with painted strips. Later strips cover earlier strips."""
     if not strips:  # one cell, whose label repeats everywhere
         return Ground(np.full((1, 1), base, np.uint8), np.zeros(2), relief)
@@ -119,7 +117,7 @@ def painted_ground(base: int, strips: Sequence[Strip] = (), relief: Relief = FLA
 
 def track(line: Line, half_m: float, relief: Relief) -> Ground:
     """Terrain with an unpaved track of half width `half_m` along a line."""
-    return painted_ground(TERRAIN, [Strip(line, -half_m, half_m, OTHER_GROUND)], relief)
+    return painted_ground(TERRAIN, [PaintedStrip(line, -half_m, half_m, OTHER_GROUND)], relief)
 
 
 def wall(start: tuple[float, float], stop: tuple[float, float], height_m: float) -> Primitive:
@@ -228,4 +226,4 @@ def driven_line(rng: np.random.Generator, site: Site, revisit: Revisit, *, right
         half_circle = line[-1] + right_m * (np.cos(angle) * forward + np.sin(angle) * left)
         path = np.concatenate([path, half_circle, shifted(line[::-1], -right_m)])
     path = resampled(path, STEP_M)
-    return resampled(shifted(path, sway_m * waves(rng, travelled(path), (15.0, 60.0))), STEP_M)
+    return resampled(shifted(path, sway_m * waves(rng, lengths_along(path), (15.0, 60.0))), STEP_M)

@@ -1,4 +1,4 @@
-"""Descriptors are used again only where they would be made the same."""
+"""A fingerprint changes if scans, mounting, positions or read options change."""
 
 import dataclasses
 import os
@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from recordings import of_scans
 
+from sglpr_jax.data.corruption import corrupted, corruption_named
 from sglpr_jax.data.fingerprint import fingerprint
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.readers import open_recording
@@ -23,6 +24,14 @@ def test_another_format_mounting_or_position_is_another_recording(tmp_path):
     found.add(fingerprint(dataclasses.replace(one, mounting=Mounting(1.0))))
     assert len(found) == 4
     assert fingerprint(one) == fingerprint(open_recording(tmp_path, format="kitti", sensor_height=1.73))
+
+
+def test_a_corrupted_recording_is_another_one(tmp_path):
+    recording = of_scans({tmp_path / "0.bin": np.ones((5, 3), np.float32)})
+    noises = [
+        corrupted(recording, corruption_named(name), seed=seed) for name, seed in (("noise-0.1", 0), ("noise-0.1", 1))
+    ]
+    assert len({fingerprint(recording), *map(fingerprint, noises)}) == 3
 
 
 def rewrite(path: Path, content: bytes) -> None:
