@@ -81,7 +81,7 @@ def check_holds_only(folder: Path, names: Collection[str]) -> None:
 
 @contextlib.contextmanager
 def exclusive_lock(folder: Path) -> Iterator[None]:
-    """Create a folder and lock it against other processes of this user and computer. At the end, remove it if it is empty.
+    """Create a folder and lock it against other processes of this user and computer. Remove it at the end if empty.
 
     The lock is a file in the system's temporary folder. It ends with the process.
 

@@ -18,7 +18,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import file_name, in_short, raising_write_error, read_json, replacing
 
-FORMAT = "sglpr-jax packed recording 2"
+FORMAT = "sglpr-jax packed recording 1"
 ABOUT_FILE = "pack.json"
 LAYOUT = {"points": ("<f4", [3]), "labels": ("<u2", []), "images": ("<f4", None)}
 """Type and shape of the rows of each array. Images of different packs have different widths."""

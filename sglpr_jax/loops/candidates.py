@@ -82,9 +82,9 @@ class CandidateSearch:
         self._time: float | None = None
         """Time of the last frame, in seconds. None if the frames have no times."""
         self._last: Query | None = None
-        """The last frame. None if it is almost empty."""
+        """The last frame that is not almost empty."""
         self._reference: Query | None = None
-        """The reference of the motion. None if it is almost empty."""
+        """The last reference of the motion that is not almost empty."""
         self._checked: Query | None = None
         """The last frame that was used to check the odometry."""
 
@@ -244,9 +244,10 @@ class CandidateSearch:
         has_moved = self.motion.reference != previous_reference or not frame
         if image.size and has_moved:
             self.background.add(image)
-        self._last = query
-        if self.motion.reference == frame:
-            self._reference = self._last
+        if query is not None:
+            self._last = query
+            if self.motion.reference == frame:
+                self._reference = query
         if not is_empty and self._is_new_place(frame):
             self.stored.add(frame, keyframe.descriptor, foreground)
         self._empty.append(is_empty)
@@ -337,7 +338,9 @@ class CandidateSearch:
         if query is None:
             return None
         links, along_ridge = list[BevRegistration](), None
-        known = {each.frame: each for each in (self._reference, self._last) if each is not None}
+        segments = self.motion.segments
+        frames = [each for each in (self._reference, self._last) if each is not None]
+        known = {each.frame: each for each in frames if segments[each.frame] == segments[-1]}
         for reference in known.values():
             prior = self.motion.prior(time, reference.frame)
             best, expected = self._register(query, reference, prior)

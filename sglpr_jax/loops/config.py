@@ -16,7 +16,7 @@ SPACING_M = 1.0
 """Minimum distance of consecutive places of a drive in a map, in metres."""
 PlaceCount = Annotated[int, Bounds(1, 1000)]
 PlaceCountOrZero = Annotated[int, Bounds(0, 1000)]
-"""Number of places whose images are compared with a query. A comparison takes milliseconds. `OrNone` accepts 0."""
+"""Number of places whose images are compared with a query. A comparison takes milliseconds. The second accepts 0."""
 INDEPENDENT_M = 25.0
 """Travelled distance after which two frames are nearly independent, in metres: the radius of the compared images."""
 MIN_CELLS = 20

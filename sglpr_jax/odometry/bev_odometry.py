@@ -292,5 +292,7 @@ class BevOdometry:
 
     @property
     def _last_step_m(self) -> float:
-        """Length of the longer one of the last two steps, in metres. The last scan may have been added twice."""
-        return float(np.linalg.norm(np.diff(self.poses[-3:, :3, 3], axis=0), axis=1).max(initial=0.0))
+        """Length of the longer one of the last two steps within a segment, in metres. The last scan may have been added
+        twice."""
+        steps_m = np.linalg.norm(np.diff(self.poses[-3:, :3, 3], axis=0), axis=1)
+        return float(steps_m[np.diff(self.segments[-3:]) == 0].max(initial=0.0))

@@ -54,7 +54,7 @@ class ImageNetwork:
         )
         clip = optax.identity() if config.clip_norm is None else optax.clip_by_global_norm(config.clip_norm)
         if config.algorithm == "adam":
-            return optax.chain(clip, optax.adam(schedule))
+            return optax.chain(clip, optax.adamw(schedule, weight_decay=0.0))
         muon = optax.contrib.muon(
             schedule,
             adam_learning_rate=lambda step: VECTOR_RATE * schedule(step),

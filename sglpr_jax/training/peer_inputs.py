@@ -1,10 +1,10 @@
 """Inputs of a learned method for all scans of recordings, computed once and stored in memory-mapped files."""
 
 import hashlib
+import importlib.metadata
 import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -97,5 +97,6 @@ def _cache_key(method: LearnedMethod, recording: Recording) -> str:
 
     After a change of other sources, such as `methods/cells.py`, delete the cache.
     """
+    versions = [package.version for package in importlib.metadata.distributions(name="sglpr-jax")]
     code = Path(inspect.getfile(method.prepare)).read_bytes()
-    return hashlib.sha256(f"{version('sglpr-jax')} {fingerprint(recording)}".encode() + code).hexdigest()[:16]
+    return hashlib.sha256(f"{versions[:1]} {fingerprint(recording)}".encode() + code).hexdigest()[:16]

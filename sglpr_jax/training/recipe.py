@@ -121,7 +121,7 @@ def train(
             "recordings": [recording.name for recording in recordings],
             "also": [recording.name for recording in also],
             "test": None if test is None else test.name,
-            "weights": own_hash(weights) if isinstance(weights, Params) else weights and str(weights),
+            "weights": _identity(weights),
         }
     with contextlib.ExitStack() as exit_stack:
         host_callback = callback if callback and is_first_host() else Callback()
@@ -229,6 +229,13 @@ def _require_usable(
                 f"model.head.input reads labels: expected labels beside every scan of sequence {recording.name}, "
                 f"found {labelled} of {len(recording)}"
             )
+
+
+def _identity(weights: Params | Path | str | None) -> str | None:
+    """Return a text that identifies initial weights: their hash, their name or the whole path of their folder."""
+    if isinstance(weights, Params):
+        return own_hash(weights)
+    return str(Path(weights).resolve()) if weights is not None and Path(weights).exists() else weights and str(weights)
 
 
 def with_teacher(config: TrainConfig) -> TrainConfig:

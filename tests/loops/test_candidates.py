@@ -188,6 +188,15 @@ def test_without_odometry_keyframes_follow_the_motion_and_a_standing_sensor_is_l
     np.testing.assert_allclose(np.linalg.norm(finder.motion.poses[:, :3, 3], axis=1), positions[finder.rows], atol=0.2)
 
 
+@pytest.mark.slow
+def test_a_scan_that_cannot_be_read_costs_the_motion_of_its_own_frame_only(params):
+    finder = finder_of(params)
+    for x in range(12):
+        finder.add_keyframe(None if x == 8 else seen_by(finder, posts_from(float(x))))
+    assert np.flatnonzero(np.diff(finder.motion.guessed_m)).tolist() == [7]
+    np.testing.assert_allclose(np.linalg.norm(finder.motion.poses[:, :3, 3], axis=1), np.arange(12.0), atol=0.2)
+
+
 def test_after_a_motion_that_is_unknown_a_scan_is_stored(params):
     finder = finder_of(params, keyframe_m=1e9)
     for _ in range(3):  # without links the motion is unknown

@@ -114,8 +114,8 @@ def _bin_format(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordForm
     for path in paths:
         paths_by_format.setdefault(format_by_name(path) or bin_format, []).append(path)
     for name, of_format in paths_by_format.items():
-        if name != bin_format:  # the format of `unknown` comes from their content
-            warn_of_doubts(of_format, name)
+        if named := [path for path in of_format if format_by_name(path)]:  # that of the others comes from their content
+            warn_of_doubts(named, name)
     description = ", ".join(f"{len(of_format)} {describe_format(name)}" for name, of_format in paths_by_format.items())
     if len(paths_by_format) == 1:
         description = describe_format(next(iter(paths_by_format)))
