@@ -27,6 +27,8 @@ from sglpr_jax.se3 import inverse, yaw_of
 
 KEYFRAME_DEG = 20.0
 """Rotation from the last frame at which a scan is the next frame at any distance, in degrees."""
+MOST_SKIPPED = 3
+"""Maximum number of scans from one frame to the next while the sensor has not moved yet. Its speed is then unknown."""
 DISTINCT = 0.4
 """Coarse correlation with scans of other places below which a place is distinct. Most places of towns are; rows of
 equal houses, aisles and parking spaces are not."""
@@ -165,6 +167,7 @@ class CandidateSearch:
 
         Without odometry, the motion since the last frame is extrapolated, so a standing sensor may move off unnoticed.
         A scan is therefore also due if the sensor, at its highest speed so far, could have moved too far to be found.
+        Until it moves for the first time, a scan is due every `MOST_SKIPPED` scans.
         Raises the ValueError of `add_keyframe`.
         """
         self._check_order(time, odometry)
@@ -176,6 +179,8 @@ class CandidateSearch:
             time = self._time_of_scan(time)
             pose = self.motion.extrapolated(time)
             if pose is None or self.motion.most_moved_m(time) >= self.verification.max_shift_m / 2:
+                return True
+            if self.motion.travelled[-1] < self.spacing_m and self.scans - self.rows[-1] >= MOST_SKIPPED:
                 return True
         moved_m, rotation = self.motion.moved(len(self) - 1, pose)
         return bool(moved_m >= self.spacing_m or rotation >= np.radians(KEYFRAME_DEG))

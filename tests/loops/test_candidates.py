@@ -189,6 +189,19 @@ def test_without_odometry_keyframes_follow_the_motion_and_a_standing_sensor_is_l
 
 
 @pytest.mark.slow
+def test_a_sensor_that_stands_at_the_start_is_seen_to_move_off(params):
+    finder = finder_of(params, keyframe_m=2.5)
+    positions = np.concatenate([np.zeros(90), np.arange(20.0)])
+    for x in positions:
+        if finder.is_due():
+            finder.add_keyframe(seen_by(finder, posts_from(x)))
+            finder.fits = finder.fits._replace(lookalike=0.2)
+        else:
+            finder.skip()
+    assert np.diff(positions[finder.rows]).max() <= 4 and not finder.motion.segments.any()
+
+
+@pytest.mark.slow
 def test_a_scan_that_cannot_be_read_costs_the_motion_of_its_own_frame_only(params):
     finder = finder_of(params)
     for x in range(12):
