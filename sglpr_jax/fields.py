@@ -1,4 +1,4 @@
-"""Checks of configurations: the annotation of a field defines the values that it accepts.
+"""Checks of configurations and arguments: the annotation of a field defines the values that it accepts.
 
 A configuration is a frozen dataclass whose `__post_init__` calls `check_fields`. Types, choices (`Literal`), tuples and
 `None` have their usual meaning. A number must be finite and must not be a bool, and `Bounds` may restrict its range.
@@ -7,6 +7,7 @@ A configuration is a frozen dataclass whose `__post_init__` calls `check_fields`
 import dataclasses
 import functools
 import math
+import os
 import sys
 import types
 import typing
@@ -133,3 +134,14 @@ def _read_union(value: Any, members: tuple[Any, ...], field: str, *, json: bool)
             expected.append(expected_type)
     expected_types = " or ".join(expected).replace("or the fields of a ", "or ")
     raise ValueError(f"{prefix}expected {expected_types}, found {found}")
+
+
+def check_is(value: Any, kind: type, *, by: str) -> None:
+    """Raise TypeError if `value` is not of type `kind`. `by` is the function of `sglpr_jax` that returns this type."""
+    if not isinstance(value, kind):
+        raise TypeError(f"expected a {kind.__name__}, found {value_or_type(value)}; sglpr_jax.{by} returns one")
+
+
+def value_or_type(value: Any) -> str:
+    """The value itself if it is a string or path, otherwise its type."""
+    return f"{value!r}" if isinstance(value, str | os.PathLike) else f"a {type(value).__name__}"

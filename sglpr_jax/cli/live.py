@@ -95,7 +95,7 @@ def run_node(
     Raises ValueError if a setting is invalid or the folder has a map of other settings, and WriteError if the folder
     cannot be written.
     """
-    from sglpr_jax.live.cloud_scans import FOLDER, CloudScans
+    from sglpr_jax.live.cloud_scans import SCANS_FOLDER, CloudScans
     from sglpr_jax.live.node import Node
     from sglpr_jax.live.result_files import write_results
 
@@ -105,7 +105,7 @@ def run_node(
         unpublished, cloud_scans = live_map.restore(), None
         if command.output.any:
             config = command.output.cloud_settings
-            cloud_scans = CloudScans(command.out / FOLDER, live_map, config=config, report=report)
+            cloud_scans = CloudScans(command.out / SCANS_FOLDER, live_map, config=config, report=report)
         sinks = []
         for sink in open_sinks():
             exit_stack.callback(_close_sink, sink, report)

@@ -1,14 +1,14 @@
 """Poses of scans: checks, and interpolation of poses at the times of the scans."""
 
-import os
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan import as_array
 from sglpr_jax.data.times import usual_step
-from sglpr_jax.files import in_short, naming
+from sglpr_jax.files import naming
 from sglpr_jax.se3 import ROTATION_TOLERANCE, are_rotations, poses_of
 
 GAP_RANGE_S = (1.0, 2.0)
@@ -54,21 +54,6 @@ def _checked_poses(values: Any, expected: str, ndim: int) -> Float[np.ndarray, "
         row = int(valid.argmin())
         raise ValueError(f"expected {expected}, with rotations, found {matrices[row].tolist()} in row {row}")
     return poses
-
-
-def as_array(values: Any, dtype: type, expected: str, *, by: str) -> np.ndarray:
-    """Convert to an array of numbers, or raise TypeError. For a path, the message names its reader, `by`."""
-    if isinstance(values, str | os.PathLike):
-        raise TypeError(f"expected {expected}, found the path {values}; read it with sglpr_jax.{by}")
-    try:
-        return np.asarray(values, dtype)
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"expected {expected}, found {value_or_type(values)} ({in_short(error)})") from error
-
-
-def value_or_type(value: Any) -> str:
-    """The value itself if it is a string or path, otherwise its type."""
-    return f"{value!r}" if isinstance(value, str | os.PathLike) else f"a {type(value).__name__}"
 
 
 def widest_gap_s(stamps: Float[np.ndarray, " n"]) -> float:

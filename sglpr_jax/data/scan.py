@@ -4,18 +4,22 @@ Drivers write times of points in several units, relative to the scan or to an ep
 takes 2 ms to 1 s, so only one unit fits the span of its times.
 """
 
+import os
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32, Shaped
 
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.files import naming
+from sglpr_jax.fields import value_or_type
+from sglpr_jax.files import in_short, naming
 from sglpr_jax.labels import to_classes
 
+MOST_COLUMNS = 8
+"""Maximum number of columns of an array of points (x, y, z, intensity and further fields). Wider arrays are images."""
 FARTHEST_M = 300.0
 """Limit of the largest coordinate of a point, in metres. No vehicle LiDAR has half of its points beyond it."""
 TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "time_stamp", "stamps", "offset_time", "ts", "gps_time")
@@ -161,3 +165,26 @@ class Scan:
             return None
         with naming(self.labels_file or self.name):
             return to_classes(self.labels, categories=categories)
+
+
+def as_scan(scan: Any) -> Scan:
+    """Convert points (n, 3) or an image (h, w) to a `Scan`. A `Scan` is returned unchanged."""
+    if isinstance(scan, Scan):
+        return scan
+    expected = "points (n, 3) or an image (h, w)"
+    array = as_array(scan, np.float32, expected, by="read_scan")
+    if array.ndim != 2:
+        raise ValueError(f"expected {expected}, found an array of shape {array.shape}")
+    if 3 < array.shape[1] <= MOST_COLUMNS:
+        raise ValueError(f"expected points (n, 3) of x, y and z only, found an array of shape {array.shape}")
+    return Scan(points=array) if array.shape[1] == 3 else Scan(image=array)
+
+
+def as_array(values: Any, dtype: type, expected: str, *, by: str) -> np.ndarray:
+    """Convert to an array of numbers, or raise TypeError. For a path, the message names its reader, `by`."""
+    if isinstance(values, str | os.PathLike):
+        raise TypeError(f"expected {expected}, found the path {values}; read it with sglpr_jax.{by}")
+    try:
+        return np.asarray(values, dtype)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"expected {expected}, found {value_or_type(values)} ({in_short(error)})") from error

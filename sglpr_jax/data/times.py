@@ -1,11 +1,14 @@
 """Times of scans and poses: checks of their unit and order, and of row numbers in place of times."""
 
+import datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, Num
 
 from sglpr_jax.data.choices import TimeUnit
+from sglpr_jax.fields import value_or_type
 from sglpr_jax.files import warn
 
 PER_SECOND = {"auto": 1.0, "s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
@@ -137,3 +140,22 @@ def nearest_rows(stamps: Num[np.ndarray, " n"], times: Num[np.ndarray, " q"]) ->
     later = np.searchsorted(stamps, times).clip(0, len(stamps) - 1)
     earlier = (later - 1).clip(0)
     return np.where(np.abs(times - stamps[earlier]) <= np.abs(stamps[later] - times), earlier, later)
+
+
+def as_seconds(time: Any) -> float | None:
+    """Convert a date or a duration to seconds, and any other time to a number. Returns None for None."""
+    if time is None:
+        return None
+    if isinstance(time, datetime.datetime):
+        time = time.astimezone(datetime.UTC).timestamp()
+    elif isinstance(time, datetime.timedelta):
+        time = time.total_seconds()
+    elif isinstance(time, np.datetime64):
+        time = time - np.datetime64(0, "s")
+    try:
+        seconds = float(time / np.timedelta64(1, "s") if isinstance(time, np.timedelta64) else time)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"expected a time in seconds, found {value_or_type(time)}") from error
+    if not np.isfinite(seconds):
+        raise ValueError(f"expected a time in seconds, found {seconds}")
+    return seconds

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from sglpr_jax.live.live_map import LiveMap
 
 
-FOLDER = "cloud-scans"
+SCANS_FOLDER = "cloud-scans"
 """Folder of the scans in that of the map."""
 
 

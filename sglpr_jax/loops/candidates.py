@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.data.mounting import Mounting, is_tilted, upright_from_lidar
 from sglpr_jax.data.scan import Scan
+from sglpr_jax.fields import check_is
 from sglpr_jax.growing import GrowingArray
-from sglpr_jax.loops.arguments import check_is
 from sglpr_jax.loops.closure import LoopClosure, renumbered, to_lidar, to_upright
 from sglpr_jax.loops.comparison import NO_FITS, Candidate, Fits, KeyframeComparison, Query
 from sglpr_jax.loops.config import MIN_CELLS, DetectorConfig
@@ -27,8 +27,6 @@ from sglpr_jax.se3 import inverse, yaw_of
 
 KEYFRAME_DEG = 20.0
 """Rotation from the last frame at which a scan is the next frame at any distance, in degrees."""
-MOST_SKIPPED = 3
-"""Maximum number of scans from one frame to the next while the sensor has not moved yet. Its speed is then unknown."""
 DISTINCT = 0.4
 """Coarse correlation with scans of other places below which a place is distinct. Most places of towns are; rows of
 equal houses, aisles and parking spaces are not."""
@@ -167,7 +165,7 @@ class CandidateSearch:
 
         Without odometry, the motion since the last frame is extrapolated, so a standing sensor may move off unnoticed.
         A scan is therefore also due if the sensor, at its highest speed so far, could have moved too far to be found.
-        Until it moves for the first time, a scan is due every `MOST_SKIPPED` scans.
+        Until it moves for the first time, its speed is unknown, and every scan is due.
         Raises the ValueError of `add_keyframe`.
         """
         self._check_order(time, odometry)
@@ -178,9 +176,8 @@ class CandidateSearch:
         else:
             time = self._time_of_scan(time)
             pose = self.motion.extrapolated(time)
-            if pose is None or self.motion.most_moved_m(time) >= self.verification.max_shift_m / 2:
-                return True
-            if self.motion.travelled[-1] < self.spacing_m and self.scans - self.rows[-1] >= MOST_SKIPPED:
+            may_be_far = self.motion.most_moved_m(time) >= self.verification.max_shift_m / 2
+            if pose is None or may_be_far or self.motion.travelled[-1] < self.spacing_m:
                 return True
         moved_m, rotation = self.motion.moved(len(self) - 1, pose)
         return bool(moved_m >= self.spacing_m or rotation >= np.radians(KEYFRAME_DEG))

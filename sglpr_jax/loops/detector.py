@@ -8,8 +8,8 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from sglpr_jax.data.poses import as_pose
-from sglpr_jax.data.scan import Scan
-from sglpr_jax.loops.arguments import as_scan, as_seconds
+from sglpr_jax.data.scan import Scan, as_scan
+from sglpr_jax.data.times import as_seconds
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.closure import LoopClosure, Reason, RejectedClosure
 from sglpr_jax.loops.comparison import Candidate, Fits

@@ -22,9 +22,9 @@ from sglpr_jax.data.poses import as_scan_poses
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled, scaled_poses
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable
+from sglpr_jax.fields import check_is
 from sglpr_jax.files import warn
 from sglpr_jax.loops.acceptance import AXES, accept_loops, check_odometry, register_loops
-from sglpr_jax.loops.arguments import check_is
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.checkpoint import add_scans
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure, convert_rejected, in_metres, renumbered, to_lidar

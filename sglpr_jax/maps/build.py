@@ -15,7 +15,7 @@ from sglpr_jax.data.poses import as_scan_poses
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled
 from sglpr_jax.data.scan_stream import OnBadScan
-from sglpr_jax.loops.arguments import check_is
+from sglpr_jax.fields import check_is
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.checkpoint import add_scans
 from sglpr_jax.loops.comparison import NO_FITS, Fits

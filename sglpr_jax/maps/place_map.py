@@ -17,10 +17,9 @@ from sglpr_jax.data.mounting import Mounting, upright_from_lidar
 from sglpr_jax.data.poses import as_poses
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled_poses, scaled_scan
-from sglpr_jax.data.scan import Scan
+from sglpr_jax.data.scan import Scan, as_scan
 from sglpr_jax.fields import check_value
 from sglpr_jax.files import naming, write_bytes
-from sglpr_jax.loops.arguments import as_scan
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.closure import LoopClosure, in_metres, planar_loop, to_lidar
 from sglpr_jax.loops.comparison import KeyframeComparison, Query

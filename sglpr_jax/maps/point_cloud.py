@@ -15,8 +15,8 @@ from sglpr_jax.data.poses import as_scan_poses
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import OnBadScan, scan_stream
+from sglpr_jax.fields import check_is
 from sglpr_jax.files import warn
-from sglpr_jax.loops.arguments import check_is
 from sglpr_jax.maps.config import CloudConfig
 from sglpr_jax.se3 import transformed
 from sglpr_jax.voxels import ABOVE, VoxelCloud, voxel_numbers

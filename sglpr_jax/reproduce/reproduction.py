@@ -69,14 +69,15 @@ class Reproduction:
 
     def config_of(self, variant: str) -> TrainConfig:
         """Return the configuration of a variant."""
-        return with_teacher(variant_config(self.config, variant))
+        return variant_config(self.config, variant)
 
     def is_trained(self, variant: str, seq: str) -> bool:
         """Return whether a run has done all steps. Raises ValueError if it has other settings or more steps."""
         folder = self._folder(variant, seq)
         if not (folder / CONFIG_FILE).is_file():  # a process that was killed early leaves a folder without a run
             return False
-        require_same_settings(folder, run_settings(self.config_of(variant), self._settings(seq)), limits=LIMITS)
+        config = with_teacher(self.config_of(variant))  # as `train` stores it
+        require_same_settings(folder, run_settings(config, self._settings(seq)), limits=LIMITS)
         path = folder / DONE_FILE
         content = read_json(path) if path.is_file() else {"steps": 0}
         steps = content.get("steps") if isinstance(content, dict) else content
@@ -145,7 +146,6 @@ class Reproduction:
             return DescriptorFile.load(path)
         with self.progress(f"embed {method} {recording.name}", len(recording)) as show:
             file = embed(describer, recording, rotation_seed=seed, batch=BATCH, on_progress=show)
-        path.parent.mkdir(parents=True, exist_ok=True)
         file.save(path)
         return file
 

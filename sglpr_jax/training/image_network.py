@@ -54,6 +54,7 @@ class ImageNetwork:
         )
         clip = optax.identity() if config.clip_norm is None else optax.clip_by_global_norm(config.clip_norm)
         if config.algorithm == "adam":
+            # Adam. The state of `optax.adam` differs from that in older checkpoints.
             return optax.chain(clip, optax.adamw(schedule, weight_decay=0.0))
         muon = optax.contrib.muon(
             schedule,

@@ -233,9 +233,11 @@ def _require_usable(
 
 def _identity(weights: Params | Path | str | None) -> str | None:
     """Return a text that identifies initial weights: their hash, their name or the whole path of their folder."""
+    if weights is None:
+        return None
     if isinstance(weights, Params):
         return own_hash(weights)
-    return str(Path(weights).resolve()) if weights is not None and Path(weights).exists() else weights and str(weights)
+    return str(Path(weights).resolve() if Path(weights).exists() else weights)
 
 
 def with_teacher(config: TrainConfig) -> TrainConfig:

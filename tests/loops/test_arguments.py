@@ -11,9 +11,9 @@ from recordings import of_scans
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.poses import as_pose, as_poses
-from sglpr_jax.data.scan import Scan
+from sglpr_jax.data.scan import Scan, as_scan
+from sglpr_jax.data.times import as_seconds
 from sglpr_jax.files import DataWarning
-from sglpr_jax.loops.arguments import as_scan, as_seconds
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Keyframe
