@@ -14,6 +14,7 @@ from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import replacing
+from sglpr_jax.revisits import has_near
 from sglpr_jax.se3 import inverse, transform
 from sglpr_jax.sim.drive import CARRIERS
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording, simulate_repeating
@@ -214,10 +215,7 @@ def is_revisit(
 ) -> Bool[np.ndarray, " n"]:
     """Whether each scan is within `near_m` of an earlier scan whose progress is at least `min_progress` less.
 
-    The progress is a time, frame number or travelled distance.
+    The progress is a time, frame number or travelled distance, and never decreases.
     """
-    revisits = np.zeros(len(positions), bool)
-    for i, position in enumerate(positions):
-        earlier = positions[progress <= progress[i] - min_progress]
-        revisits[i] = len(earlier) > 0 and np.linalg.norm(earlier - position, axis=1).min() < near_m
-    return revisits
+    ends = np.searchsorted(progress, progress - min_progress, side="right")
+    return has_near(positions, positions, ends, lambda metres: metres < near_m)

@@ -1,8 +1,8 @@
 """Run the commands on small simulated data, and compare all that they write with an earlier run, for a refactoring.
 
-    python -m benchmarks.goldens build/before                            # before the change
-    python -m benchmarks.goldens build/after --beside build/before       # after it: every file has the same bytes
-    python -m benchmarks.goldens build/after --beside build/before --within 1e-6    # numbers may differ by this
+    python -m benchmarks goldens build/before                            # before the change
+    python -m benchmarks goldens build/after --beside build/before       # after it: every file has the same bytes
+    python -m benchmarks goldens build/after --beside build/before --within 1e-6    # numbers may differ by this
 
 The commands simulate three towns, a car park and a walker in a yard. They search loops, also between two halves of a
 town (every second scan), correct a trajectory, build a map and find a scan in it, score two methods, and train two
@@ -19,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 import safetensors.numpy
-import tyro
 from jaxtyping import Shaped
 
 from benchmarks.timing import run_command
@@ -154,7 +153,3 @@ def _near(one: Shaped[np.ndarray, "..."], other: Shaped[np.ndarray, "..."], *, w
 def text_of(path: Path) -> str:
     """Text of a file without its durations and rates."""
     return SECONDS.sub('""', path.read_text())
-
-
-if __name__ == "__main__":
-    tyro.cli(main)

@@ -5,9 +5,9 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
+from scipy.spatial.distance import cdist
 
 from sglpr_jax.same_place import EXCLUDED_FRAMES, EXCLUDED_S, POSITIVE_M
-from sglpr_jax.se3 import distances
 
 BLOCK_QUERIES = 32
 """Number of queries that are compared with the database at a time, so that the distances fit in the cache."""
@@ -53,7 +53,7 @@ def has_near(
     for start in range(0, len(queries), BLOCK_QUERIES):
         rows = slice(start, start + BLOCK_QUERIES)
         end = ends[rows].max()
-        is_near = near(distances(queries[rows], database[:end]))
+        is_near = near(cdist(queries[rows], database[:end]))
         is_in_database = np.arange(end) < ends[rows, None]
         is_revisit[rows] = np.any(is_near & is_in_database, axis=1)
     return is_revisit

@@ -112,10 +112,14 @@ def from_quaternions(
     return poses_of(translations, Rotation.from_quat(quaternions).as_matrix().reshape(-1, 3, 3))
 
 
+def lengths_along(line: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+    """Length of a polyline from its first point to each point."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+
+
 def travelled(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " n"]:
     """Travelled distance from the first pose to each pose, in metres."""
-    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    return lengths_along(poses[:, :3, 3])
 
 
 def are_rotations(matrices: Float[np.ndarray, "*b 3 3"]) -> Bool[np.ndarray, "*b"]:
@@ -129,11 +133,3 @@ def have_unit_length(quaternions: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, 
     """Whether each quaternion has length 1, up to `ROTATION_TOLERANCE`, and so is a rotation."""
     with np.errstate(invalid="ignore", over="ignore"):  # NaN and infinity have another length
         return np.abs(np.linalg.norm(quaternions, axis=1) - 1) <= ROTATION_TOLERANCE
-
-
-def distances(a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "n m"]:
-    """Return the Euclidean distances in metres (float64) between every position of `a` and every position of `b`."""
-    squared = np.zeros((len(a), len(b)))
-    for a_axis, b_axis in zip(a.astype(np.float64).T, b.astype(np.float64).T, strict=True):
-        squared += np.subtract.outer(a_axis, b_axis) ** 2
-    return np.sqrt(squared)

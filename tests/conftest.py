@@ -70,7 +70,8 @@ def pytest_runtest_setup(item):
         jax.clear_caches()  # of programs compiled the other way
         jax.config.update("jax_disable_most_optimizations", quickly)
         os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(quickly))
-    jaxtyping.config.update("jaxtyping_disable", where.startswith(AS_INSTALLED))
+    whole = where.startswith(RUN_LONG) and item.get_closest_marker("slow") is not None  # searches of whole drives
+    jaxtyping.config.update("jaxtyping_disable", whole or where.startswith(AS_INSTALLED))
 
 
 SHARED = TESTS.parents[1] / "shared"

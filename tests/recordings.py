@@ -1,6 +1,8 @@
-"""Recordings for the tests: points and images in memory, labels in files."""
+"""Recordings for the tests: points and images in memory, labels in files; and what a file for rerun holds."""
 
 import dataclasses
+import subprocess
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -53,3 +55,10 @@ def kitti_trajectory(root: Path, name: str, *, pose_source: str) -> tuple[np.nda
     file = f"poses/{name}.txt" if pose_source == "kitti" else f"sequences/{name}/poses.txt"
     times = root / "sequences" / name / "times.txt"
     return read_kitti(root / file)[:, :3, 3], read_times(times) if times.is_file() else None, file
+
+
+def entities(path: Path) -> set[str]:
+    """Entities of a file for the rerun viewer, as the program of rerun lists them."""
+    command = [sys.executable, "-m", "rerun", "rrd", "print", str(path)]
+    run = subprocess.run(command, capture_output=True, text=True, check=True)
+    return {word for line in run.stdout.splitlines() for word in line.replace("`", " ").split() if word.startswith("/")}

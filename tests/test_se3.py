@@ -1,7 +1,6 @@
 """Transforms against products of matrices."""
 
 import hypothesis
-import hypothesis.extra.numpy as hnp
 import hypothesis.strategies as st
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from sglpr_jax.se3 import (
     adjoint,
     are_rotations,
-    distances,
     from_quaternions,
     inverse,
     quaternions,
@@ -72,13 +70,3 @@ def test_rotations_are_distinguished_from_other_matrices(angle, error):
     mirror, damaged = turned * [1, 1, -1], turned + np.full((3, 3), error)
     np.testing.assert_array_equal(are_rotations(np.stack([turned, mirror, damaged])), [True, False, error == 0])
     assert are_rotations(turned)
-
-
-@hypothesis.settings(deadline=None, max_examples=25)
-@hypothesis.given(
-    hnp.arrays(np.float64, (5, 3), elements=coordinates), hnp.arrays(np.float64, (4, 3), elements=coordinates)
-)
-def test_distances_are_norms_of_differences(a, b):
-    expected = np.linalg.norm(a[:, None] - b[None], axis=-1)
-    np.testing.assert_allclose(distances(a, b), expected, rtol=1e-12)
-    np.testing.assert_array_equal(distances(a, a), distances(a, a).T)

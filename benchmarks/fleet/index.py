@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float32
 
 import sglpr_jax
+from sglpr_jax.methods.pairwise import unit_length
 from sglpr_jax.numpy_files import read_arrays
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.fleet_index import FleetIndex
@@ -67,7 +68,7 @@ class Drives:
         rows = rng.integers(len(self.step), size=(4, len(places)))
         weights = rng.standard_normal((4, len(places), 1), dtype=np.float32) / 2
         noise = sum(weight * self.step[row] for weight, row in zip(weights, rows, strict=True))
-        return _unit(places + (self.spread if spread is None else spread) * noise)
+        return unit_length(places + (self.spread if spread is None else spread) * noise)
 
     def draw(self, n: int, rng: np.random.Generator) -> Float32[np.ndarray, "n d"]:
         """Descriptors of `n` new places."""
@@ -77,11 +78,7 @@ class Drives:
 
 def random_places(n: int, width: int, rng: np.random.Generator) -> Float32[np.ndarray, "n d"]:
     """Random directions."""
-    return _unit(rng.standard_normal((n, width), dtype=np.float32))
-
-
-def _unit(rows: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "n d"]:
-    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    return unit_length(rng.standard_normal((n, width), dtype=np.float32))
 
 
 class Asked(NamedTuple):

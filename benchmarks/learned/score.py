@@ -33,7 +33,7 @@ from sglpr_jax.models.sglpr import init
 from sglpr_jax.models.weights_file import LAST_WEIGHTS
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import embed
-from sglpr_jax.revisits import database_end, has_near
+from sglpr_jax.revisits import revisits
 from sglpr_jax.training.trainer import SCORES_FILE
 from sglpr_jax.training.validation import FOUND_M
 
@@ -206,10 +206,8 @@ def _recall(file: DescriptorFile, answers: np.ndarray | None) -> float:
     """
     assert file.positions is not None and answers is not None
     xy = file.positions[:, :2]
-    ends = database_end(len(xy), times=file.times)  # frame i is compared with the frames before ends[i]
-    queries = np.flatnonzero(ends)
-    revisits = queries[has_near(xy[queries], xy, ends[queries], lambda metres: metres <= FOUND_M)]
-    if not len(revisits):
+    rows = np.flatnonzero(revisits(xy, times=file.times, radius_m=FOUND_M))
+    if not len(rows):
         return math.nan
-    distance = np.linalg.norm(xy[revisits] - xy[answers[revisits]], axis=1)
-    return float(np.mean((distance <= FOUND_M) & (answers[revisits] >= 0)))
+    distance = np.linalg.norm(xy[rows] - xy[answers[rows]], axis=1)
+    return float(np.mean((distance <= FOUND_M) & (answers[rows] >= 0)))

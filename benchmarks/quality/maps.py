@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
+from scipy.spatial.distance import cdist
 
 import sglpr_jax
 from benchmarks.drives import lidar, on_disk
@@ -21,7 +22,7 @@ from sglpr_jax.maps.config import CloudConfig
 from sglpr_jax.maps.point_cloud import point_cloud
 from sglpr_jax.odometry.kiss_icp import scan_odometry
 from sglpr_jax.pose_graph.files import write_tum
-from sglpr_jax.se3 import distances, inverse, transformed, yaw_of
+from sglpr_jax.se3 import inverse, transformed, yaw_of
 from sglpr_jax.sim.labels import MOVING
 from sglpr_jax.sim.recording import SimulatedRecording, plan_sessions, simulate_recording
 from sglpr_jax.sim.sensor import SENSORS
@@ -145,7 +146,7 @@ def _located_in(
 
     Returns the numbers of right answers, of right answers with a probability of at least 0.9, and of queries.
     """
-    distance = distances(query.world_from_lidar[:, :2, 3], first.world_from_lidar[:, :2, 3])
+    distance = cdist(query.world_from_lidar[:, :2, 3], first.world_from_lidar[:, :2, 3])
     mounting, right, sure, count = Mounting(SENSORS[query.sensor].height_m), 0, 0, 0
     for row in np.flatnonzero(distance.min(axis=1) < APART_M)[::every].tolist():
         nearest = int(distance[row].argmin())
@@ -222,7 +223,7 @@ def _locate(mapped: MappedDrive, queried: MappedDrive) -> Bool[np.ndarray, "3 n"
     Returns for each query whether its nearest descriptor is right, its pose is right, and its pose is wrong but sure.
     """
     places = mapped.places
-    distance = distances(queried.poses[:, :2, 3], places.world_from_place[:, :2, 3])
+    distance = cdist(queried.poses[:, :2, 3], places.world_from_place[:, :2, 3])
     rows = np.flatnonzero(distance.min(axis=1) < APART_M)
     results = np.zeros((3, len(rows)), bool)
     for i, row in enumerate(rows.tolist()):

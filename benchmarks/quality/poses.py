@@ -13,6 +13,7 @@ import jax
 import numpy as np
 import tyro
 from jaxtyping import Float, Int
+from scipy.spatial.distance import cdist
 from scipy.stats import chi2
 
 import sglpr_jax
@@ -30,7 +31,7 @@ from sglpr_jax.registration import bev_search
 from sglpr_jax.registration.bev_alignment import refine
 from sglpr_jax.registration.bev_spectra import match_spectra, query_spectra
 from sglpr_jax.registration.gicp import register
-from sglpr_jax.se3 import distances, transform_covariance
+from sglpr_jax.se3 import transform_covariance
 from sglpr_jax.sim.recording import SimulatedRecording
 from sglpr_jax.sim.sceneries import REPEATING
 from sglpr_jax.sim.styles import SCENERIES
@@ -118,7 +119,7 @@ def _squares(errors: np.ndarray, covariances: np.ndarray, axes: np.ndarray) -> F
 def _revisits(recording: SimulatedRecording, count: int, rng: np.random.Generator) -> Int[np.ndarray, "n 2"]:
     """Draws pairs of query and match. Half of the matches are the nearest scan, the others have random distances."""
     positions, times = recording.poses.world_from_lidar[:, :3, 3], recording.poses.times
-    distance = distances(positions, positions)
+    distance = cdist(positions, positions)
     distance[(distance > APART_M) | (times[:, None] - times[None] < APART_S)] = np.inf
     queries = np.sort(rng.permutation(np.flatnonzero(np.isfinite(distance).any(axis=1)))[:count])
     wanted_distance = np.where(rng.random(len(queries)) < 0.5, 0, rng.uniform(0, APART_M, len(queries)))

@@ -5,11 +5,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from benchmarks.described import REPEATING_M, WAY_M
 from benchmarks.drives import Drive, is_revisit
-from sglpr_jax.se3 import distances, inverse, travelled, wrap_angle, yaw_of
+from sglpr_jax.se3 import inverse, lengths_along, travelled, wrap_angle, yaw_of
 from sglpr_jax.sim.styles import SCENERIES
 
 Poses = Float[np.ndarray, "n 4 4"]
@@ -80,7 +81,7 @@ def count_loops(closures: Sequence[Closure], positions: Float[np.ndarray, "n 3"]
     """Counts loops. A loop is right if two of its scans are near each other, and wrong if all are far apart."""
     right, wrong, found_scans = 0, 0, set[int]()
     for newer, older in closures:
-        distance = distances(positions[newer], positions[older]).min(axis=1)  # of each newer scan
+        distance = cdist(positions[newer], positions[older]).min(axis=1)  # of each newer scan
         right += int(distance.min() <= rule.right_m)
         wrong += int(distance.min() > rule.wrong_m)
         found_scans |= set(newer[distance <= rule.right_m].tolist())
@@ -90,7 +91,7 @@ def count_loops(closures: Sequence[Closure], positions: Float[np.ndarray, "n 3"]
 
 def represented(scans: Iterable[int], positions: Float[np.ndarray, "n 3"]) -> set[int]:
     """The scans, and those within `KEYFRAME_M` of path of one of them."""
-    travelled_m = np.append(0.0, np.linalg.norm(np.diff(positions, axis=0), axis=1).cumsum())
+    travelled_m = lengths_along(positions)
     found_m = travelled_m[sorted(scans)]
     is_near = (np.abs(travelled_m[:, None] - found_m[None]) <= KEYFRAME_M).any(axis=1)
     return set(np.flatnonzero(is_near).tolist())

@@ -23,7 +23,7 @@ from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.views import view
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.models.weights import Params
-from sglpr_jax.se3 import distances, inverse, transformed
+from sglpr_jax.se3 import inverse, transformed
 from sglpr_jax.sim.drive import TimedPoses, plan_path, poses_on
 from sglpr_jax.sim.recording import SimulatedRecording
 from sglpr_jax.sim.sensor import Sensor, scan
@@ -223,8 +223,8 @@ def _motion_errors(speed_mps: float, turn_deg: float, towns: list[list[_ScanStar
         for name in ("skewed", "deskewed", "again"):
             descriptor_distances[name].append(np.linalg.norm(descriptors[name] - descriptors["still"], axis=1))
         xy = np.array([start.xy for start in starts])
-        distance = distances(descriptors["still"], descriptors["still"])
-        distance[distances(xy, xy) < OTHER_PLACE_M] = np.inf
+        distance = cdist(descriptors["still"], descriptors["still"])
+        distance[cdist(xy, xy) < OTHER_PLACE_M] = np.inf
         descriptor_distances["other"].append(distance.min(axis=1))
     metres = [np.concatenate(errors) for errors in point_errors.values()]
     cells = [f"{np.median(errors):.3f}, 95 % {np.quantile(errors, 0.95):.3f}" for errors in metres]

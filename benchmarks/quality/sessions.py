@@ -17,10 +17,9 @@ import sglpr_jax
 from benchmarks import described
 from benchmarks.drives import drifted, lidar
 from benchmarks.quality.scoring import OTHER_M
-from sglpr_jax.se3 import inverse, wrap_angle, yaw_of
+from sglpr_jax.se3 import inverse, lengths_along, wrap_angle, yaw_of
 from sglpr_jax.sim.drive import PlanarPath, drive_seed, plan_path
 from sglpr_jax.sim.recording import PAUSE_S, drive_through
-from sglpr_jax.sim.routes import lengths_along
 from sglpr_jax.sim.sensor import Sensor
 from sglpr_jax.sim.world import build_world
 

@@ -6,13 +6,14 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial.distance import cdist
 
 import sglpr_jax
 from benchmarks.drives import drifted, lidar, on_disk
 from benchmarks.table import Table
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import only
-from sglpr_jax.se3 import distances
+from sglpr_jax.se3 import lengths_along
 from sglpr_jax.sim.drive import PlanarPath, plan_path, timed
 from sglpr_jax.sim.recording import drive_through
 from sglpr_jax.sim.world import build_world
@@ -84,8 +85,8 @@ def _recalls(drives: list[Drive], params: sglpr_jax.Params, length_m: float, eve
     is_described = np.isfinite(descriptors).all(axis=1)
     descriptors = np.where(is_described[:, None], descriptors, 0.0)
     mapped = (passes == 0) & is_described
-    nearest = distances(descriptors, descriptors[mapped]).argmin(axis=1)
-    apart = distances(positions, positions[mapped])
+    nearest = cdist(descriptors, descriptors[mapped]).argmin(axis=1)
+    apart = cdist(positions, positions[mapped])
     right = (apart[np.arange(len(apart)), nearest] <= RIGHT_M) & is_described
     answerable = apart.min(axis=1) <= RIGHT_M
     return [float(right[answerable & (passes == number)].mean()) for number in range(1, len(PASSES))]
@@ -135,7 +136,7 @@ def rendered(sensor: str, seed: int, metres: int, azimuth_steps: int, folder: Pa
 def _street(seed: int, metres: int) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
     """Line of `metres` metres with a point every half metre, and the unit vectors to its left."""
     xy = plan_path(np.random.default_rng((seed, 5)), ROUTE, scans=600, rate_hz=10.0).xy
-    length_m = np.concatenate([[0.0], np.linalg.norm(np.diff(xy, axis=0), axis=1).cumsum()])
+    length_m = lengths_along(xy)
     even_m = np.arange(0.0, metres, 0.5)
     line = np.stack([np.interp(even_m, length_m, axis) for axis in xy.T], axis=1)
     direction = np.gradient(line, axis=0)

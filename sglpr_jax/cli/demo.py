@@ -1,6 +1,7 @@
 """bin/demo: simulate a drive, find its loops and correct its trajectory, as bin/loops does with any scans."""
 
 import dataclasses
+import importlib.util
 import shlex
 import sys
 from pathlib import Path
@@ -34,7 +35,9 @@ def demo(command: DemoCommand) -> int:
     from sglpr_jax.cli.datasets import simulate  # slow import, not needed for --help
 
     drive, out = command.out / "drive", command.out / "found"
-    files = ("--cloud", out / "map.ply", "--grid", out / "map.yaml", "--rerun", out / "drive.rrd")
+    files = ["--cloud", out / "map.ply", "--grid", out / "map.yaml"]
+    if importlib.util.find_spec("rerun"):  # of the extra `view`
+        files += ["--rerun", out / "drive.rrd"]
     arguments = [str(word) for word in (drive, "--odometry", AUTO, "--optimize", "--out", out, *files)]
     loops = dataclasses.replace(parse_command(LoopsCommand, "loops", arguments), open=command.open)
     check_flags(loops)  # an error before the simulation if a package is missing

@@ -55,7 +55,7 @@ class EmbedCommand:
     submap: tyro.conf.OmitArgPrefixes[OdometrySubmapOptions] = OdometrySubmapOptions()
     scale: ScaleChoice = 1
     """Factor for all lengths before scans are described. 2 or 4 enlarges places that are small in an image, such as
-    rooms. `auto` is 4 if most points are less than 8 m away, otherwise 1."""
+    rooms. `auto` is 4 if nine tenths of the points are less than 8 m away, otherwise 1."""
     rotate: bool = False
     """Rotate every scan about z by its own random angle."""
     corruption: str | None = None

@@ -42,7 +42,8 @@ class EvaluateCommand:
     published: bool = False
     """Also print the paper's numbers, marked as published: table 1 for the sequence, or table 3 with --database."""
     out: Path | None = None
-    """Folder for results.json, report.html, command.json and the pictures. None: FILE without its suffix."""
+    """Folder for results.json, report.html, command.json and the pictures. None: FILE without its suffix, plus
+    -results if this name is taken, for example by the folder of the scans."""
     poses: Path | None = None
     """Pose file with one row per frame. If FILE has times, poses at other times are interpolated. If --skip-bad skipped
     scans of FILE, a row for every scan is accepted, too. None: the poses in FILE, or those of --data."""
@@ -146,5 +147,9 @@ def _check_options(command: EvaluateCommand) -> None:
 
 
 def _default_folder(file: Path) -> Path:
-    """Return the path of a file without its suffix, or with "-results" appended if it has no suffix."""
-    return file.with_suffix("") if file.suffix else file.with_name(f"{file.name}-results")
+    """Return the path of a file without its suffix, plus "-results" if that path exists and is no folder of results."""
+    from sglpr_jax.evaluation.evaluation_page import PAGE
+
+    folder = file.with_suffix("")
+    is_free = not folder.exists() or (folder / PAGE).is_file()
+    return folder if is_free else folder.with_name(f"{folder.name}-results")

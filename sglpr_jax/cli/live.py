@@ -12,7 +12,7 @@ import tyro
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.recording import CloudOptions, DetectorFlags
 from sglpr_jax.cli.runtime import print_error
-from sglpr_jax.files import exclusive_lock
+from sglpr_jax.files import exclusive_lock, in_short
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.stop_request import stop_on_signal
@@ -68,7 +68,7 @@ def live(command: LiveCommand) -> int:
     report = Reports()
 
     def open_source_of(live_map: "LiveMap") -> "Source":
-        return open_source(command.source, command, report, is_in_map=live_map.names.__contains__)
+        return open_source(command.source, command, report, map_names=live_map.names)
 
     def open_sinks() -> Iterator["Sink"]:
         return (open_sink(sink, command, report) for sink in command.sinks)
@@ -123,8 +123,12 @@ def run_node(
             say(f"{command.out}: {', '.join(path.name for path in paths)}")
         if cloud_scans is not None:
             recording, poses = cloud_scans.recording(command.sensor_height)
+
+            def report_bad_scan(scan: str, error: Exception) -> None:
+                report("cloud", f"scan {scan} is not in the cloud: {in_short(error, most=300)}")
+
             with contextlib.redirect_stdout(sys.stderr):  # standard output has the lines of the sink `json`
-                command.output.write([recording], [poses])
+                command.output.write([recording], [poses], on_bad_scan=report_bad_scan)
 
 
 def _check_endpoints(command: LiveCommand) -> None:

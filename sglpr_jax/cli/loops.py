@@ -21,7 +21,6 @@ from sglpr_jax.cli.recording import (
 )
 from sglpr_jax.cli.runtime import open_page, with_installed_names
 from sglpr_jax.data.choices import ScaleChoice
-from sglpr_jax.extras import install_command
 from sglpr_jax.files import check_writable, exclusive_lock
 from sglpr_jax.loops.config import Degenerate
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
@@ -78,7 +77,7 @@ class LoopsCommand:
     submap: tyro.conf.OmitArgPrefixes[SubmapOptions] = SubmapOptions()
     scale: ScaleChoice = 1
     """Factor for all lengths while scans are compared. 2 or 4 enlarges places that are small in an image, such as
-    rooms. Results are in metres. `auto` is 4 if most points are less than 8 m away, otherwise 1."""
+    rooms. Results are in metres. `auto` is 4 if nine tenths of the points are less than 8 m away, otherwise 1."""
     register: bool = True
     """Register the full scans of loops in 6 degrees of freedom and check their overlap. Images are not
     registered."""
@@ -127,7 +126,7 @@ def check_flags(command: LoopsCommand) -> None:
     """Raise ValueError if flags are inconsistent or an input would be overwritten, ImportError without an extra."""
     from sglpr_jax.odometry import kiss_icp  # slow imports, not needed for --help
     from sglpr_jax.pose_graph.factor_graph import gtsam_library
-    from sglpr_jax.pose_graph.folder import TRAJECTORIES
+    from sglpr_jax.pose_graph.folder import LOOPS_G2O, TRAJECTORIES
 
     recordings, files = command.recordings, command.odometry_files
     if not recordings:
@@ -155,7 +154,7 @@ def check_flags(command: LoopsCommand) -> None:
     for path in (*files, command.source.poses, command.source.times):
         if path is None or path.resolve().parent != command.folder.resolve():
             continue
-        if path.name in TRAJECTORIES or path.name.startswith("trajectory-"):
+        if path.name in (LOOPS_G2O, *TRAJECTORIES) or path.name.startswith("trajectory-"):
             raise ValueError(
                 f"{path}: expected inputs that this run does not overwrite, found an output file; choose another --out"
             )
@@ -168,27 +167,24 @@ def _search_and_write(command: LoopsCommand) -> int:
     from sglpr_jax.loops.checkpoint import delete_checkpoint
     from sglpr_jax.loops.closure import why_rejected
     from sglpr_jax.loops.result import diagnose_no_loops
-    from sglpr_jax.loops.search import can_register, find_loops
+    from sglpr_jax.loops.search import find_loops
     from sglpr_jax.models.weights_file import load
     from sglpr_jax.pose_graph.folder import write_loop_folder
     from sglpr_jax.pose_graph.optimize import describe_errors, optimize_trajectory, placements
 
     params, out, checkpoint = load(command.weights), command.folder, command.folder / UNFINISHED
     detector = command.decision.detector  # raises an error for invalid settings before the recordings are opened
-    odometry_checkpoints = [out / f"unfinished-{number}.odometry.log" for number in range(len(command.recordings))]
     effective, recordings, odometry = open_with_odometry(
         command,
         command.recordings,
         AUTO if command.odometry == AUTO else command.odometry_files,
         format=command.odometry_format,
-        checkpoint=odometry_checkpoints.__getitem__,
+        checkpoint=lambda number: checkpoint / f"{number}" / "odometry.log",
     )
     command.output.check_recordings(recordings)
-    unregistrable = next((recording for recording in recordings if not can_register(recording)), None)
-    if command.register and unregistrable is not None:
-        missing = f"small-gicp is not installed: {install_command('slam')}"
-        reason = "they are ready-made images" if unregistrable.has_images else missing
-        print(f"{unregistrable.name}: loops are not registered, because {reason}", file=sys.stderr)
+    images = next((recording for recording in recordings if recording.has_images), None)
+    if command.register and images is not None:
+        print(f"{images.name}: loops are not registered, because they are ready-made images", file=sys.stderr)
     title = recordings[0].name if len(recordings) == 1 else f"of {len(recordings)} recordings"
     # Each scan is compared within its recording, and then with every earlier recording.
     comparisons = sum((1 + number) * len(recording) for number, recording in enumerate(recordings))
@@ -198,7 +194,7 @@ def _search_and_write(command: LoopsCommand) -> int:
             params,
             odometry=odometry or None,
             config=detector,
-            registered=command.register and unregistrable is None,
+            registered=command.register and images is None,
             scale=effective.scale,
             on_bad_scan=report_bad_scan if command.skip_bad else None,
             kept_in=checkpoint,
@@ -236,12 +232,7 @@ def _search_and_write(command: LoopsCommand) -> int:
             list(itertools.compress(result.split(optimized.poses), connected)),
             on_bad_scan=report_bad_scan if command.skip_bad else None,
         )
-    if len(recordings) > 1:
-        for number in range(len(recordings)):
-            delete_checkpoint(checkpoint / f"{number}")
     delete_checkpoint(checkpoint)
-    for path in odometry_checkpoints:
-        path.unlink(missing_ok=True)
     if command.rerun is not None:
         viewer = Path(sys.executable).with_name("rerun")
         print(f"{command.rerun}: shown by {viewer} {command.rerun}")

@@ -80,8 +80,8 @@ class MapCommand:
     submap: tyro.conf.OmitArgPrefixes[SubmapOptions] = SubmapOptions()
     scale: ScaleChoice = 1
     """Factor for all lengths before scans are described. 2 or 4 enlarges places that are small in an image, such as
-    rooms. The map stores it, and its poses are in metres. `auto` is 4 if most points are less than 8 m away, otherwise
-    1."""
+    rooms. The map stores it, and its poses are in metres. `auto` is 4 if nine tenths of the points are less than 8 m
+    away, otherwise 1."""
     output: tyro.conf.OmitArgPrefixes[CloudOptions] = CloudOptions()
     skip_bad: bool = False
     """Report unreadable scans and skip them."""
@@ -112,10 +112,9 @@ def _build_and_write(command: MapCommand, params: "Params") -> int:
 
     from sglpr_jax.loops.checkpoint import delete_checkpoint
     from sglpr_jax.maps.build import map_recording
-    from sglpr_jax.maps.place_map import PlaceMap, poses_by_id
+    from sglpr_jax.maps.place_map import PlaceMap, place_names
     from sglpr_jax.models.weights import weights_hash
     from sglpr_jax.pose_graph.files import write_tum
-    from sglpr_jax.retrieval.descriptor_file import check_made_alike
 
     existing_map = None
     if command.add_to is not None:
@@ -135,7 +134,7 @@ def _build_and_write(command: MapCommand, params: "Params") -> int:
         write_tum(command.file.with_suffix(ODOMETRY), poses, times)
     if existing_map is not None:
         with naming(f"{command.add_to}"):
-            check_made_alike({"scale": effective.scale}, {"scale": existing_map.scale})
+            existing_map.index.check(scale=effective.scale)
     unfinished = command.file.with_suffix(UNFINISHED)
     with stop_on_signal() as stop, progress_bar(f"map {recording.name}", len(recording)) as show:
         new_map, scans, skipped = map_recording(
@@ -155,7 +154,8 @@ def _build_and_write(command: MapCommand, params: "Params") -> int:
     elif len(new_map):
         whole_map, new_places = new_map, len(new_map)
         if existing_map is not None:
-            whole_map, world_from_new = _merge_maps(command, existing_map, new_map, poses_by_id(recording, poses))
+            drive = dict(zip(place_names(recording), poses, strict=True))
+            whole_map, world_from_new = _merge_maps(command, existing_map, new_map, drive)
             new_places = len(whole_map) - len(existing_map)
         if is_stopped and _has_more_places(command.file, len(whole_map)):
             print(f"{command.file}: unchanged, because it has more places than the {len(whole_map)} found until now")

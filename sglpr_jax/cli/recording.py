@@ -16,7 +16,7 @@ from sglpr_jax.data.choices import (
     SensorHeight,
     TimeUnit,
 )
-from sglpr_jax.fields import NotNegative
+from sglpr_jax.fields import Count, NotNegative, Share
 from sglpr_jax.files import check_writable, file_name
 from sglpr_jax.loops.config import MIN_PROBABILITY, CandidateConfig, DetectorConfig
 from sglpr_jax.maps.config import CloudConfig, OccupancyConfig
@@ -44,8 +44,8 @@ class RecordingOptions:
     """Selection of a recording in a folder, and options for reading it."""
 
     seq: str | None = None
-    """Sequence, session of NCLT (2012-01-15), or point cloud topic of a bag that has several. May be omitted if there
-    is only one."""
+    """Sequence, session of NCLT (2012-01-15), or point cloud topic of a bag that has several, with _ for /
+    (livox_lidar). May be omitted if there is only one."""
     pose_source: PoseChoice = "auto"
     """Pose files of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
     format: ScanFormat = "auto"
@@ -63,7 +63,7 @@ class RecordingOptions:
     imu_topic: str | None = dataclasses.field(default=None, kw_only=True)
     """IMU topic of a bag, for the gravity of each scan. By default, the one beside the topic of the LiDAR is used."""
     time_unit: TimeUnit = dataclasses.field(default="auto", kw_only=True)
-    """Unit of the times in text files: times.txt, tum and csv. `auto` expects seconds, reports times whose steps
+    """Unit of the times in text files: times.txt, tum and csv. `auto` expects seconds, rejects times whose steps
     contradict this, and ignores row numbers (0, 1, 2, ...)."""
 
     def open(self, root: Path, **more_options: Any) -> "Recording":
@@ -230,17 +230,17 @@ class OdometrySubmapOptions(SubmapOptions):
 class DetectorFlags:
     """Settings of the loop detector, with the drift of the odometry in usual units."""
 
-    drift_percent: float = DRIFT_PERCENT
+    drift_percent: NotNegative = DRIFT_PERCENT
     """Position drift of the odometry: one standard deviation, in percent of the travelled distance. Loops that need
     more than four standard deviations are rejected as contradicting the odometry: raise it then."""
-    drift_deg_per_100m: float = DRIFT_DEG_PER_100M
+    drift_deg_per_100m: NotNegative = DRIFT_DEG_PER_100M
     """Heading drift of the odometry: one standard deviation, in degrees per 100 m."""
-    min_probability: float = MIN_PROBABILITY
+    min_probability: Share = MIN_PROBABILITY
     """Minimum probability of a loop."""
-    keyframe_m: float = DetectorConfig.keyframe_m
+    keyframe_m: NotNegative = DetectorConfig.keyframe_m
     """Distance between the keyframes, in metres, and a fifth of it where places look alike. Only these scans are
     searched and stored. 0 searches every scan."""
-    max_places: int | None = DetectorConfig.max_places
+    max_places: Count | None = DetectorConfig.max_places
     """Maximum number of stored scans, to limit memory. By default all are stored."""
     candidates: CandidateConfig = DetectorConfig.candidates
     verification: VerificationConfig = DetectorConfig.verification
@@ -316,14 +316,15 @@ def open_with_odometry(
     from sglpr_jax.data.deskew import has_point_times  # slow imports, not needed for --help
     from sglpr_jax.odometry.kiss_icp import check_installed
 
-    poses = []
+    poses, submaps = [], [command.submap] * len(paths)
     if odometry == AUTO:
         check_installed()
         recordings = [command.source.open(path) for path in paths]
         command = dataclasses.replace(command, scale=resolved_scale(command.scale, *recordings))
         poses = [_odometry_of(recording, command, checkpoint(number)) for number, recording in enumerate(recordings)]
-        deskew = command.submap.deskew or all(map(has_point_times, recordings))
-        submap = dataclasses.replace(command.submap, deskew=deskew)
+        has_times = list(map(has_point_times, recordings))
+        submaps = [dataclasses.replace(command.submap, deskew=command.submap.deskew or has) for has in has_times]
+        submap = dataclasses.replace(command.submap, deskew=all(each.deskew for each in submaps))
         settings = dataclasses.replace(command.scan_odometry, voxel_m=command.scan_odometry.used_voxel_m)
         command = dataclasses.replace(command, submap=submap, scan_odometry=settings)
     elif odometry:
@@ -334,8 +335,8 @@ def open_with_odometry(
         recordings = [command.source.open(path) for path in paths]
     poses_or_none = poses or [None] * len(recordings)
     recordings = [
-        command.submap.deskewed_submaps(recording, recording_poses)
-        for recording, recording_poses in zip(recordings, poses_or_none, strict=True)
+        submap.deskewed_submaps(recording, recording_poses)
+        for submap, recording, recording_poses in zip(submaps, recordings, poses_or_none, strict=True)
     ]
     return dataclasses.replace(command, scale=resolved_scale(command.scale, *recordings)), recordings, poses
 

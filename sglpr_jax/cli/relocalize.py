@@ -28,7 +28,8 @@ class RelocalizeCommand:
     Other answers follow only if they are more than 20 m (divided by the scale of the map) from every more probable one.
     They share the probability: if several places fit equally well, none of them is probable.
 
-    Without --frame, --sensor-height auto takes the mounting of the map's last place.
+    Without --frame, --sensor-height auto takes the mounting of the map's last place. If the sensor of the map tilts,
+    the mounting is estimated from the ground in the scan.
 
     Example:
       bin/relocalize my_scans/000003.bin --map town.safetensors
@@ -62,17 +63,16 @@ def relocalize(command: RelocalizeCommand) -> None:
     from sglpr_jax.maps.query import query_of, read_query
     from sglpr_jax.models.weights import weights_hash
     from sglpr_jax.models.weights_file import load
-    from sglpr_jax.retrieval.descriptor_file import check_made_alike
 
     if command.out is not None:
         check_writable(command.out)
-    unused = command.submap.flag or (command.submap.odometry and "--odometry") or (command.source.seq and "--seq")
+    unused = command.submap.flag or (command.submap.odometry and "--odometry") or _recording_flag(command.source)
     if command.frame is None and unused:
         raise ValueError(f"{command.scan}: expected --frame with {unused}, found a single scan")
     params = load(command.weights)
     place_map = PlaceMap.load(command.map, weights_hash=weights_hash(params))
     with naming(command.map):
-        check_made_alike({"scale": command.scale or place_map.scale}, {"scale": place_map.scale})
+        place_map.index.check(scale=command.scale)
     name = command.scan.name
     if command.frame is None:
         source = command.source
@@ -95,6 +95,14 @@ def relocalize(command: RelocalizeCommand) -> None:
         ]
         write_json(command.out, values)
     console().print(_answer_table(name, answers, apart_m=NEGATIVE_M / place_map.scale))
+
+
+def _recording_flag(source: RecordingOptions) -> str | None:
+    """Return the first stated flag that has no effect on a single scan, or None."""
+    defaults = vars(RecordingOptions())
+    unused = (name for name in defaults if name not in ("format", "sensor_height"))
+    stated = (f"--{name.replace('_', '-')}" for name in unused if getattr(source, name) != defaults[name])
+    return next(stated, None)
 
 
 def _answer_table(name: str, answers: "list[Relocalization]", *, apart_m: float) -> Table:

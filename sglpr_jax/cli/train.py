@@ -98,7 +98,7 @@ def train_and_test(command: TrainCommand) -> None:
 
     folder = run_folder(command)
     with connected(hosts=command.hosts, host_index=command.host_index, coordinator=command.coordinator):
-        recordings, also, test = _open_recordings(command)
+        recordings, also, test = open_recordings(command)
         result = _train(command, recordings, also, test)
     if is_first_host():
         out, seed = folder / "test", command.config.seed
@@ -127,24 +127,28 @@ def _train(
     from sglpr_jax.evaluation.learning_curves import LearningCurves
     from sglpr_jax.training.callbacks import EVENTS, Callbacks, EventFiles, ProgressBar
     from sglpr_jax.training.devices import is_first_host
-    from sglpr_jax.training.recipe import train
+    from sglpr_jax.training.recipe import PackingStopped, train
 
     folder = run_folder(command)
     event_files = [EventFiles(folder / EVENTS)] if command.tensorboard else []
     with stop_on_signal() as stopped:
-        result = train(
-            command.config,
-            recordings,
-            out=folder,
-            test=test,
-            also=also,
-            weights=command.weights,
-            resume=command.resume,
-            cache=command.cache,
-            callback=Callbacks(ProgressBar(), LearningCurves(folder), *event_files),
-            stopped=stopped,
-            settings=settings(command),
-        )
+        try:
+            result = train(
+                command.config,
+                recordings,
+                out=folder,
+                test=test,
+                also=also,
+                weights=command.weights,
+                resume=command.resume,
+                cache=command.cache,
+                callback=Callbacks(ProgressBar(), LearningCurves(folder), *event_files),
+                stopped=stopped,
+                settings=settings(command),
+            )
+        except PackingStopped as stop:
+            stopped.exit(f"{stop}; run the same command again")
+            raise
     if is_first_host():
         print(result, file=sys.stderr)
     exit_unless_finished(result, stopped, stop_advice="continue with --resume")
@@ -157,15 +161,23 @@ def exit_unless_finished(result: "TrainResult", stopped: StopRequest, *, stop_ad
         stopped.exit(f"stopped at step {result.steps} of {result.config.steps}; {stop_advice}")
 
 
-def _open_recordings(command: TrainCommand) -> "tuple[Sequence[Recording], Sequence[Recording], Recording]":
-    """Open the training recordings, those of --also, and the test recording. Raises ValueError if --also is --data."""
+def open_recordings(command: TrainCommand) -> "tuple[Sequence[Recording], Sequence[Recording], Recording]":
+    """Open the training recordings, those of --also, and the test recording.
+
+    Raises ValueError if --also is --data, or if the test recording lacks what a method of --method needs.
+    """
     from sglpr_jax.cli.datasets import all_recordings, dataset_root, leave_one_out, without_bad_scans
+    from sglpr_jax.data.scan_stream import require_content
+    from sglpr_jax.methods.handcrafted import HANDCRAFTED
 
     roots = command.data if isinstance(command.data, tuple) else (dataset_root(command.data),)
     if not roots:
         raise ValueError("--data: expected a dataset, found none")
     options = {name: getattr(command, name) for name in ("pose_source", "format", "sensor_height")}
     recordings, test = leave_one_out(roots, command.seq, train_seqs=command.train_seq, **options)
+    for name in command.method:
+        if name in HANDCRAFTED:
+            require_content(name, HANDCRAFTED[name].takes, test)
     also = [recording for folder in command.also for recording in all_recordings(folder, **options)]
     resolved = {root.resolve() for root in roots}
     if same := [folder for folder in command.also if folder.resolve() in resolved]:

@@ -4,7 +4,6 @@ A scan takes about 0.1 s, and each point is relative to the pose of the sensor w
 moves the points of a scan into the frame of one pose. `deskewed` does so for a recording, with the poses of its scans.
 """
 
-import contextlib
 import dataclasses
 import hashlib
 from pathlib import Path
@@ -15,6 +14,7 @@ from jaxtyping import Float, Float32
 from sglpr_jax.data.poses import as_scan_poses
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
+from sglpr_jax.files import warn
 
 TICK_S = 2e-5
 """Resolution of the times of points, in seconds. In this time, a point at 50 m moves by 3 mm if the sensor turns by 180
@@ -24,7 +24,7 @@ WIDEST_S = 1.0
 DESKEWED = "deskewed"
 """Name of the read option that describes the trajectory of a deskewed recording."""
 MOST_TRIED = 5
-"""Maximum number of scans, from the first one, that are read to find a readable scan."""
+"""Maximum number of scans, from the first one, that are read to find a scan with valid times of its points."""
 
 
 def deskew(
@@ -86,13 +86,14 @@ def poses_at(
 def deskewed(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"]) -> Recording:
     """Return a recording whose scans are deskewed when they are read: the points of scan i are in the frame of pose i.
 
-    A scan without another scan within a second before or after it is not changed.
+    A scan without another scan within a second before or after it, or with invalid times of points, is not changed.
 
     Arguments:
       recording: Recording of scans with times, whose points have times (`Scan.point_times`).
       world_from_lidar: Pose of the LiDAR at the time of each scan, from odometry or a map.
 
-    Raises ValueError if scans or points have no times, or if the poses do not fit the scans.
+    Raises ValueError if scans or points have no times, those of the points in the first scans are invalid, or the poses
+    do not fit the scans.
 
     Example:
       recording = sglpr_jax.deskewed(recording, sglpr_jax.read_odometry("odometry.tum"))
@@ -101,21 +102,17 @@ def deskewed(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"])
     poses, times = as_scan_poses(world_from_lidar, recording, of="poses"), recording.times
     if times is None:
         raise ValueError(f"sequence {recording.name}: expected times of the scans to remove their motion, found none")
-    first = _first_readable(recording)
-    if first is not None and first.point_times is None:
-        raise ValueError(
-            f"sequence {recording.name}: expected times of the points to remove the motion within scans, found none"
-        )
+    _check_point_times(recording)
 
     def read(row: int, label_path: Path | None) -> Scan:
         """Read and deskew a scan. The result has no times of points."""
         scan = recording.read_row(row, label_path)
-        point_times = scan.point_times
-        rows = _rows_near(times, row)
-        if point_times is None:
+        if scan.time_field is None:
             raise ValueError(f"{scan.name}: expected times of the points, found none")
+        point_times = valid_point_times(scan)
+        rows = _rows_near(times, row)
         points = scan.cloud
-        if len(rows) > 1:
+        if point_times is not None and len(rows) > 1:
             trajectory = {"pose_times": times[rows], "world_from_lidar": poses[rows]}
             points = deskew(points, point_times, time=float(times[row]), **trajectory)
         return dataclasses.replace(scan, points=points, time_field=None)
@@ -138,19 +135,47 @@ def _rows_near(times: Float[np.ndarray, " n"], row: int) -> list[int]:
 
 
 def has_point_times(recording: Recording) -> bool:
-    """Whether scans have increasing times and the points of the first readable scan have valid times."""
-    if recording.has_images or recording.times is None or not (np.diff(recording.times) > 0).all():
-        return False
-    scan = _first_readable(recording)
+    """Whether the motion within the scans can be removed (`point_times_problem`)."""
+    return not point_times_problem(recording)
+
+
+def point_times_problem(recording: Recording) -> str:
+    """Describe why the motion within the scans cannot be removed: "no times of points". Empty if it can be.
+
+    Scans need increasing times, and the points of one of the first `MOST_TRIED` scans need valid times.
+    """
+    if recording.has_images or not len(recording):
+        return "no scans"
+    if recording.times is None:
+        return "no times of scans"
     try:
-        return scan is not None and scan.point_times is not None
-    except ValueError:
-        return False
+        _check_point_times(recording)
+    except (ValueError, OSError):
+        return "no times of points"
+    rows = np.flatnonzero(np.diff(recording.times) <= 0)
+    return f"no later time of scan {recording.ids[rows[0] + 1]} than of the scan before it" if rows.size else ""
 
 
-def _first_readable(recording: Recording) -> Scan | None:
-    """The first scan that can be read, among the first `MOST_TRIED`, or None."""
+def valid_point_times(scan: Scan) -> Float32[np.ndarray, " n"] | None:
+    """Return `Scan.point_times`. If they are invalid, as those of part of a turn, warns and returns None."""
+    try:
+        return scan.point_times
+    except ValueError as error:
+        warn(f"{error}; the motion within this scan is not removed")
+        return None
+
+
+def _check_point_times(recording: Recording) -> None:
+    """Raise the first error of the first `MOST_TRIED` scans if none of them is readable with valid times of points."""
+    first_error: Exception | None = None
     for row in range(min(len(recording), MOST_TRIED)):
-        with contextlib.suppress(ValueError, OSError):  # reading the whole recording reports or skips bad scans
-            return recording.scan(row, labels=False)
-    return None
+        try:
+            if recording.scan(row, labels=False).point_times is not None:
+                return
+            raise ValueError(
+                f"sequence {recording.name}: expected times of the points to remove the motion within scans, found none"
+            )
+        except (ValueError, OSError) as error:
+            first_error = first_error or error
+    if first_error is not None:
+        raise first_error

@@ -29,9 +29,8 @@ LASER_FIELDS = ("ring", "channel", "line", "laser_id", "laser")
 UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
 """Possible units of the times of points, in seconds."""
 SHORTEST_S, LONGEST_S = 0.002, 1.0
-"""Range of the duration of a scan, in seconds. Their ratio is below 1000, so that only one unit fits."""
-ABSOLUTE_S = 10.0
-"""Minimum time of a point since an epoch, in seconds. Smaller times are relative to the scan."""
+"""Range of the duration of a scan, in seconds. Their ratio is below 1000, so that only one unit fits. Times of points
+beyond the longest duration are times since an epoch, and others are relative to the scan."""
 SAME_CLOCK_S = 1.0
 """Maximum time between a scan and its points, in seconds, if both have the same clock."""
 
@@ -100,7 +99,7 @@ class TimeField(NamedTuple):
                 f"{first:.10g} to {last:.10g}, which no unit from s to ns makes so"
             )
         first_s = origin_s = first * unit_s
-        if abs(first_s) < ABSOLUTE_S:
+        if abs(first_s) <= LONGEST_S:
             origin_s = 0.0
         elif scan_time is not None and abs(first_s - scan_time) <= SAME_CLOCK_S:
             origin_s = scan_time

@@ -142,21 +142,26 @@ class _KeyframeWindow:
         self._length_m, self._keyframe_m = length_m, keyframe_m
         self._frames = 0
         most = math.ceil(length_m / keyframe_m) + KEYFRAMES_PER_TURN
-        self._keyframes: deque[tuple[int, float, Float[np.ndarray, "4 4"]]] = deque(maxlen=most)
-        """Frame number, travelled distance in metres and pose of each keyframe."""
+        self._keyframes: deque[tuple[int, float]] = deque(maxlen=most)
+        """Frame number and travelled distance in metres of each keyframe in the window."""
+        self._last: tuple[float, Float[np.ndarray, "4 4"]] | None = None
+        """Travelled distance in metres and pose of the last keyframe, also if it left the window."""
 
     def add(self, pose: Float[np.ndarray, "4 4"]) -> tuple[int, ...]:
         """Add the next frame. Returns its number, then those of the keyframes in the window, the newest first."""
         frame = self._frames
         self._frames += 1
         step_m, turn_deg, path_m = math.inf, 0.0, 0.0  # the first frame is a keyframe
-        if self._keyframes:
-            _, last_path_m, last_pose = self._keyframes[-1]
+        if self._last is not None:
+            last_path_m, last_pose = self._last
             step_m, turn_deg = _distance_and_angle(last_pose, pose)
             path_m = last_path_m + step_m
-        in_window = [row for row, row_path_m, _ in reversed(self._keyframes) if path_m - row_path_m <= self._length_m]
+        while self._keyframes and path_m - self._keyframes[0][1] > self._length_m:
+            self._keyframes.popleft()  # for good: `path_m` decreases if the sensor returns to the last keyframe
+        in_window = [row for row, _ in reversed(self._keyframes)]
         if step_m >= self._keyframe_m or turn_deg >= KEYFRAME_DEG:
-            self._keyframes.append((frame, path_m, pose))
+            self._keyframes.append((frame, path_m))
+            self._last = path_m, pose
         return (frame, *in_window)
 
 

@@ -53,7 +53,10 @@ def _with_positions(root: Path, name: str, **options: Any) -> Recording:
     """Open a recording. Raises ValueError if it has no positions."""
     recording = open_recording(root, name, **options)
     if recording.positions is None:
-        raise ValueError(f"{root}: sequence {name} has no poses; training and testing need them")
+        raise ValueError(
+            f"{root}: sequence {name} has no poses, which training and testing need; use a folder of sequences with "
+            "poses, or choose them (bin/train --train-seq)"
+        )
     return recording
 
 

@@ -34,13 +34,21 @@ SAME_S = 0.001
 """Times in two files are the same up to this difference in seconds."""
 
 
-def read_input(path: Path, trajectory: Trajectory | None, *, sequence: str, distance: str | None = None) -> Input:
+def read_input(
+    path: Path,
+    trajectory: Trajectory | None,
+    *,
+    sequence: str,
+    distance: str | None = None,
+    fallback: Trajectory | None = None,
+) -> Input:
     """Read an input file of any kind.
 
     Arguments:
       trajectory: Positions and times of the frames. If None, only those in the file are used.
       sequence: Name of the sequence, for files that do not contain it.
       distance: Name of the distance between the descriptors of a .npy file, L2 by default. A .npz file has its own.
+      fallback: Replaces `trajectory`, if this is None, for a .npz file without positions.
 
     Raises ValueError, with the name of the file, if the file is invalid or does not fit the other arguments.
     """
@@ -53,7 +61,7 @@ def read_input(path: Path, trajectory: Trajectory | None, *, sequence: str, dist
     if distance is not None:
         raise ValueError(f"{path}: expected a .npy file with --distance, found a file that defines its own distance")
     if path.suffix == ".npz":
-        return read_descriptor_file(path, trajectory)
+        return read_descriptor_file(path, trajectory, fallback)
     if ":" in next((line for _, line in _read_lines(path)), ""):
         return _read_top_k_list(path, trajectory, sequence=sequence)
     return _read_pair_list(path, trajectory)
@@ -69,10 +77,12 @@ def read_methods(
 ) -> dict[str, Input]:
     """Read the file of each method by `read_input`. Returns the inputs by method name: the file name without suffix.
 
+    Files without positions have those of the first file. Files without times have the first times in a file.
+
     Arguments:
       paths: Files of the methods. If file names are equal, the whole path is the name of the method.
-      poses: Positions that replace those of every file. If they have no times, the first times in a file are used.
-      dataset: Positions for files other than .npz, if the first file has no positions and `poses` is None.
+      poses: Positions that replace those of every file.
+      dataset: Positions for files without their own, if the first file has none and `poses` is None.
       sequence: Name of the sequence. By default the name of each file.
       distance: Name of the distance between descriptors, for the first file and for every .npy file.
     """
@@ -83,15 +93,22 @@ def read_methods(
         trajectory = poses if path.suffix == ".npz" else first_trajectory or poses or dataset
         name = path.stem if file_names.count(path.stem) == 1 else str(path)
         file_distance = distance if path == paths[0] or path.suffix == ".npy" else None
-        method = read_input(path, trajectory, sequence=sequence or path.stem, distance=file_distance)
+        method = read_input(
+            path,
+            trajectory,
+            sequence=sequence or path.stem,
+            distance=file_distance,
+            fallback=first_trajectory or dataset,
+        )
         if not methods and isinstance(method, DescriptorFile) and method.positions is not None:
             source = method.pose_source or method.sequence
-            first_trajectory = Trajectory(method.positions, method.times, source, by_row=True)
+            first_trajectory = Trajectory(method.positions, method.times, source)
         methods[name] = method
-    if poses is not None:
-        timed = {name: method for name, method in methods.items() if not isinstance(method, ScoredPairs)}
-        times = next((method.times for method in timed.values() if method.times is not None), None)
-        methods |= {name: replace(method, times=times) for name, method in timed.items() if method.times is None}
+    timed = {name: method for name, method in methods.items() if not isinstance(method, ScoredPairs)}
+    times = next((method.times for method in timed.values() if method.times is not None), None)
+    for name, method in timed.items():
+        if times is not None and method.times is None and len(method) == len(times):
+            methods[name] = replace(method, times=times)
     return methods
 
 
@@ -127,7 +144,7 @@ def as_descriptors(
         descriptors = np.array(rows, dtype=np.float32)
     return DescriptorFile(
         sequence=sequence,
-        ids=tuple(f"{row:06d}" for row in range(len(rows))),
+        ids=_row_ids(len(rows)),
         positions=trajectory.positions,
         times=trajectory.times,
         descriptors=descriptors,
@@ -138,8 +155,15 @@ def as_descriptors(
     )
 
 
-def read_descriptor_file(path: Path, trajectory: Trajectory | None = None) -> DescriptorFile:
-    """Read a descriptor file, optionally with the positions of another trajectory.
+def _row_ids(n: int) -> tuple[str, ...]:
+    """Return the ids of frames that are known only by their row."""
+    return tuple(f"{row:06d}" for row in range(n))
+
+
+def read_descriptor_file(
+    path: Path, trajectory: Trajectory | None = None, fallback: Trajectory | None = None
+) -> DescriptorFile:
+    """Read a descriptor file, optionally with the positions of another trajectory, or of `fallback` if it has none.
 
     If the times of the trajectory and the file differ, positions are interpolated (`poses_at_scans`) and frames without
     a pose are dropped. The times of the file are kept if it has any, except with `Trajectory.by_row`. If `bin/embed`
@@ -148,6 +172,8 @@ def read_descriptor_file(path: Path, trajectory: Trajectory | None = None) -> De
     Raises ValueError if the trajectory does not fit, or if neither the file nor the trajectory has positions.
     """
     file = DescriptorFile.load(path)
+    if trajectory is None and file.positions is None:
+        trajectory = fallback
     if trajectory is None:
         if file.positions is None:
             raise ValueError(f"{path}: expected positions to score against, found descriptors of scans without poses")
@@ -287,12 +313,17 @@ def _require_trajectory(path: Path, trajectory: Trajectory | None) -> Trajectory
 
 
 def check_agreement(first: Input, other: Input) -> None:
-    """Raise ValueError if `other` has other frames, positions or times than `first`: scores are then not comparable."""
+    """Raise ValueError if `other` has other frames, positions or times than `first`: scores are then not comparable.
+
+    The ids of a file are not compared if they are row numbers, as those of a .npy file.
+    """
     if isinstance(first, DescriptorFile) and isinstance(other, DescriptorFile) and first.ids != other.ids:
-        pairs = itertools.zip_longest(first.ids, other.ids, fillvalue="none more")
-        first_id, other_id = next((a, b) for a, b in pairs if a != b)
-        expected = f"expected the frames of the first file, {len(first)} with {first_id!r}"
-        raise ValueError(f"{expected}, found {len(other)} with {other_id!r}")
+        has_row_ids = any(file.ids == _row_ids(len(file)) for file in (first, other))
+        if len(first) != len(other) or not has_row_ids:
+            pairs = itertools.zip_longest(first.ids, other.ids, fillvalue="none more")
+            first_id, other_id = next((a, b) for a, b in pairs if a != b)
+            expected = f"expected the frames of the first file, {len(first)} with {first_id!r}"
+            raise ValueError(f"{expected}, found {len(other)} with {other_id!r}")
     if not isinstance(first, ScoredPairs) and not isinstance(other, ScoredPairs):
         first_times, other_times = ("none" if source.times is None else "times" for source in (first, other))
         if first_times != other_times:

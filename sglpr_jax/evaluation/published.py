@@ -51,7 +51,6 @@ class Table:
     """One table of the paper. The columns are sequences."""
 
     number: int
-    title: str
     dataset: str
     columns: tuple[str, ...]
     rows: tuple[Row, ...]
@@ -60,7 +59,7 @@ class Table:
 def _read(table: dict[str, Any]) -> Table:
     """Return a table of `published.json`, whose rows are lists of method, kind, source, scores and printed mean."""
     rows = tuple(Row(method, tuple(scores), mean, kind, source) for method, kind, source, scores, mean in table["rows"])
-    return Table(table["number"], table["title"], table["dataset"], tuple(table["columns"]), rows)
+    return Table(table["number"], table["dataset"], tuple(table["columns"]), rows)
 
 
 TABLES = tuple(map(_read, json.loads((resources.files("sglpr_jax.evaluation") / "published.json").read_text())))

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 
+from sglpr_jax.data.scan import Scan
+from sglpr_jax.data.scan_stream import scan_stream
 from sglpr_jax.evaluation.loops_page import overlaid_scans, wrong_loops
 from sglpr_jax.extras import install_command
 from sglpr_jax.files import replacing
@@ -81,29 +83,30 @@ def _viewer_layout(*, with_map: bool) -> Any:
 def _log_map(
     rerun: Any, stream: Any, session: Session, poses: Float[np.ndarray, "n 4 4"], *, is_corrected: bool
 ) -> None:
-    """Log the trajectories, the position of the sensor at each frame, and a scan every `KEYFRAME_M`."""
+    """Log the trajectories, the position of the sensor at each frame, and a readable scan every `KEYFRAME_M`."""
     stream.log("map", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     trajectories = {"given": (poses, GREY)}
     if is_corrected and session.odometry is not None:
         trajectories = {"given": (session.odometry[: session.frames], GREY), "corrected": (poses, BLUE)}
     for name, (path, colour) in trajectories.items():
         stream.log(f"map/trajectory/{name}", rerun.LineStrips3D([path[:, :3, 3]], colors=[colour]), static=True)
-    _, keyframes = np.unique(np.floor(travelled(poses) / KEYFRAME_M), return_index=True)  # first frame of each 5 m
-    # Known positions have no rotation and images no points, so neither can place scans in the map.
-    with_scans = session.odometry is not None and not session.recording.has_images
     for frame, pose in enumerate(poses):
         stream.set_time(TIMELINE, sequence=frame)
         stream.log("map/sensor", rerun.Points3D([pose[:3, 3]], radii=[1.0], colors=[BLUE]))
-        if with_scans and frame in keyframes and session.recording.ids[frame] not in session.skipped:
-            points = session.recording.scan(frame, labels=False).points
-            if points is not None and len(points):
-                map_points = transformed(pose, _thinned_points(points).astype(np.float64)).astype(np.float32)
-                stream.log(f"map/scans/{frame}", rerun.Points3D(map_points, colors=[DARK_GREY], radii=[0.05]))
+    if session.odometry is None or session.recording.has_images:
+        return  # Known positions have no rotation and images no points, so neither can place scans in the map.
+    _, rows = np.unique(np.floor(travelled(poses) / KEYFRAME_M), return_index=True)  # first frame of each 5 m
+    options = {"rows": rows.tolist(), "on_bad_scan": lambda scan, error: None}
+    for frame, points in scan_stream(session.recording, _thinned_points, **options):
+        if points is not None:
+            map_points = transformed(poses[frame], points.astype(np.float64)).astype(np.float32)
+            stream.set_time(TIMELINE, sequence=frame)
+            stream.log(f"map/scans/{frame}", rerun.Points3D(map_points, colors=[DARK_GREY], radii=[0.05]))
 
 
-def _thinned_points(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "m 3"]:
-    """Return the first finite point in each voxel."""
-    finite = points[np.isfinite(points).all(axis=1)]
+def _thinned_points(frame: int, scan: Scan) -> Float32[np.ndarray, "m 3"]:
+    """Return the first finite point of a scan in each voxel."""
+    finite = scan.cloud[np.isfinite(scan.cloud).all(axis=1)]
     return one_per_voxel(finite, VOXEL_M)
 
 

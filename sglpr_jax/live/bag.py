@@ -3,7 +3,7 @@
 import dataclasses
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from sglpr_jax.data.readers import open_recording, recording_names
@@ -11,17 +11,18 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.files import in_short
 from sglpr_jax.live.data_types import WAIT_S, LatestScan, LiveFrame, Report
 from sglpr_jax.live.options import LiveOptions
-from sglpr_jax.live.sources_and_sinks import IsInMap
 
 
 class BagSource:
     """Scans of a bag at the times of their headers, `rate` times as fast. With `rate=0`, as fast as they are taken."""
 
-    def __init__(self, root: Path, recording: Recording, options: LiveOptions, report: Report, is_in_map: IsInMap):
-        """Begin after the last scan for which `is_in_map` is true."""
+    def __init__(
+        self, root: Path, recording: Recording, options: LiveOptions, report: Report, map_names: Collection[str]
+    ):
+        """Begin after the last scan whose name is in `map_names`."""
         self._root, self._recording, self._rate, self._report = root.resolve(), recording, options.rate, report
         self._poses = None if options.odometry_topic is None else recording.world_from_lidar
-        last_taken = max((row for row in range(len(recording)) if is_in_map(self._scan_name(row))), default=-1)
+        last_taken = max((row for row in range(len(recording)) if self._scan_name(row) in map_names), default=-1)
         self._rows = range(last_taken + 1, len(recording))
         self._latest: LatestScan[LiveFrame] = LatestScan()
         self._stopped, self._ended = threading.Event(), threading.Event()
@@ -74,7 +75,7 @@ class BagSource:
         return f"{self._root}, scan {self._recording.ids[row]}"
 
 
-def open_source(where: str, options: LiveOptions, report: Report, is_in_map: IsInMap) -> BagSource:
+def open_source(where: str, options: LiveOptions, report: Report, map_names: Collection[str]) -> BagSource:
     """Open the bag `where`.
 
     Raises:
@@ -87,9 +88,10 @@ def open_source(where: str, options: LiveOptions, report: Report, is_in_map: IsI
     name = None if options.topic is None else options.topic.strip("/").replace("/", "_")
     if len(names) == 1 and name not in names:  # a single recording is not named by its topic
         name = None
+    pose_topic = options.odometry_topic or ""  # without odometry, scans without a pose are not dropped
     recording = open_recording(
-        root, name, pose_topic=options.odometry_topic, sensor_height=options.sensor_height, gravity="recording"
+        root, name, pose_topic=pose_topic, sensor_height=options.sensor_height, gravity="recording"
     )
     if options.odometry_topic is not None and recording.world_from_lidar is None:
         raise ValueError(f"{root}: expected poses with rotations on {options.odometry_topic}, found none")
-    return BagSource(root, recording, options, report, is_in_map)
+    return BagSource(root, recording, options, report, map_names)

@@ -78,6 +78,8 @@ class LoopEdge(NamedTuple):
     another odometry frame, such as one before a restart."""
     latency_s: float
     """Time from the arrival of the latest scan to the loop, in seconds. A loop may belong to a scan before it."""
+    odometry_frame: int = 0
+    """Number of the odometry frame of the latest scan. It changes when the odometry begins in a frame of its own."""
 
 
 class LatestScan(Generic[T]):

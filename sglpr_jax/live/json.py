@@ -1,22 +1,25 @@
 """Sink that writes results as JSON lines, whose `type` is `frame` (`FrameStatus`) or `loop` (`LoopEdge`)."""
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
-from sglpr_jax.files import raising_write_error
+from sglpr_jax.files import append_whole, raising_write_error
 from sglpr_jax.live.data_types import FrameStatus, LoopEdge, Report
 from sglpr_jax.live.options import LiveOptions
 
 
 class JsonLines:
-    """Writes a line for each scan and each loop, and flushes it."""
+    """Writes a line for each scan and each loop at once, into a file completely or not at all."""
 
-    def __init__(self, file: IO[str]):
-        self._file = file
+    def __init__(self, file: IO[str], *, begin: str = ""):
+        """Take a file that is open for appending, or standard output. `begin` is written before the first line."""
+        self._file, self._begin = file, begin
+        self._is_stored = file is not sys.stdout and file.seekable()  # not a pipe
 
     def frame(self, status: FrameStatus) -> None:
         self._write("frame", status)
@@ -31,8 +34,13 @@ class JsonLines:
 
     def _write(self, kind: str, message: FrameStatus | LoopEdge) -> None:
         values = {name: _json_value(value) for name, value in message._asdict().items()}
-        self._file.write(json.dumps({"type": kind, **values}) + "\n")
-        self._file.flush()
+        line = self._begin + json.dumps({"type": kind, **values}) + "\n"
+        if self._is_stored:
+            descriptor = self._file.fileno()
+            append_whole(descriptor, line.encode(), size=os.fstat(descriptor).st_size)
+        else:
+            print(line, end="", file=self._file, flush=True)
+        self._begin = ""
 
 
 def _json_value(value: Any) -> Any:
@@ -46,5 +54,15 @@ def open_sink(where: str, options: LiveOptions, report: Report) -> JsonLines:
     """Open standard output, or the file `where` for appending. Raises WriteError if the file cannot be written."""
     if not where:
         return JsonLines(sys.stdout)
-    with raising_write_error(Path(where)):
-        return JsonLines(Path(where).open("a", encoding="utf-8"))
+    path = Path(where)
+    with raising_write_error(path):
+        return JsonLines(path.open("a", encoding="utf-8"), begin="\n" if _ends_within_line(path) else "")
+
+
+def _ends_within_line(path: Path) -> bool:
+    """Whether a file ends without a line break, as after a full disk."""
+    if not path.is_file() or not path.stat().st_size:
+        return False
+    with path.open("rb") as file:
+        file.seek(-1, os.SEEK_END)
+        return file.read() != b"\n"

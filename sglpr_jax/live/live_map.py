@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from sglpr_jax.data.choices import SensorHeight
 from sglpr_jax.data.poses import as_pose
-from sglpr_jax.files import append_whole, raising_write_error
+from sglpr_jax.files import append_whole, raising_write_error, text_bytes, write_bytes
 from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.live.data_types import LiveFrame, LoopEdge, Report
@@ -24,7 +24,7 @@ from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.comparison import NO_FITS, Fits
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Keyframe
-from sglpr_jax.pose_graph.files import loop_lines, read_loops_jsonl, write_loops_jsonl
+from sglpr_jax.pose_graph.files import loop_lines, read_loops_jsonl
 from sglpr_jax.pose_graph.incremental import IncrementalTrajectory
 
 FRAMES_LOG, LOOPS_FILE = "frames.log", "loops.jsonl"
@@ -96,6 +96,7 @@ class LiveMap:
         self.detector, self._report = detector, report
         self.names: set[str] = set()
         """Names of the scans that have one."""
+        self._name_bytes = 0  # of all names
         self.trajectory: IncrementalTrajectory | None = None
         """Odometry that the loops correct. None without odometry or gtsam."""
         if expects_odometry:
@@ -123,9 +124,8 @@ class LiveMap:
     @property
     def nbytes(self) -> int:
         """Number of bytes of detector, times, odometry and its correction. The memory of programs is not counted."""
-        names = sum(map(sys.getsizeof, self.names))
         parts = [self.detector, self._stamps, self._poses, *([] if self.trajectory is None else [self.trajectory])]
-        return names + sum(part.nbytes for part in parts)
+        return self._name_bytes + sum(part.nbytes for part in parts)
 
     @property
     def loops(self) -> list[LoopClosure]:
@@ -185,13 +185,16 @@ class LiveMap:
         return read_loops_jsonl(self._loops_path, skip_damaged=True) if self._loops_path.is_file() else []
 
     def _rewrite_loops(self, loops: list[LoopClosure]) -> list[LoopClosure]:
-        """Write the loops to a new file and open it for appending. Returns loops that the old file lacks."""
+        """Write the loops to a new file, unless the old one has the same content, and open it for appending. Returns
+        loops that the old file lacks."""
         path = self._loops_path
         written = self._written_loops()
         missed = _missing(loops, written)
         if missed and written:
             self._report("log", f"{path}: {len(missed)} loops were added that the last process missed")
-        write_loops_jsonl(path, loops)
+        content = text_bytes(loop_lines(loops))
+        if not path.is_file() or path.read_bytes() != content:  # with an equal file, a full disk does not matter
+            write_bytes(path, content)
         with raising_write_error(path):
             self._loops_file = os.open(path, os.O_WRONLY | os.O_APPEND)
         return missed
@@ -270,8 +273,9 @@ class LiveMap:
             finder.skip()
         self._part = scan.part
         self._stamps.append(scan.stamp)
-        if scan.name:
+        if scan.name and scan.name not in self.names:
             self.names.add(scan.name)
+            self._name_bytes += sys.getsizeof(scan.name)
         if scan.pose is not None:
             self._poses.append(scan.pose)
             if self.trajectory is not None:
@@ -294,20 +298,23 @@ class LiveMap:
         """Write a scan to the log and its loops to their file. After an error, the map continues in memory only."""
         if self._log is None:
             return
+        side = "before"
         try:
-            about = {name: getattr(scan, name) for name in ABOUT}
-            self._log.append(len(self) - 1, frame_bytes(scan.keyframe, compared, pose=scan.pose, **about))
             with raising_write_error(self._loops_path):
                 status = os.fstat(self._loops_file)
                 if not status.st_nlink:
                     raise FileNotFoundError("the file was removed")
+            about = {name: getattr(scan, name) for name in ABOUT}
+            self._log.append(len(self) - 1, frame_bytes(scan.keyframe, compared, pose=scan.pose, **about))
+            side = "after"
+            with raising_write_error(self._loops_path):
                 append_whole(self._loops_file, loop_lines(loops).encode(), size=status.st_size)
             if time.monotonic() - self._synced_at > SYNC_S:
                 self._log.sync()
                 os.fsync(self._loops_file)
                 self._synced_at = time.monotonic()
         except OSError as error:
-            self._report("disk", f"{error}; the map is not written any more, and a restart continues before this scan")
+            self._report("disk", f"{error}; the map is not written any more, and a restart continues {side} this scan")
             with contextlib.suppress(OSError):
                 self._log.close()
             self._log = None
@@ -338,6 +345,7 @@ class LiveMap:
             world_from_query=query_pose,
             world_from_match=match_pose,
             latency_s=time.monotonic() - received,
+            odometry_frame=int(latest),
         )
 
 

@@ -30,6 +30,8 @@ LIVOX_CUSTOM_MSG = (
 )
 LINE_LIST = 5
 """Value of `type` of a marker that draws a line between points 0 and 1, 2 and 3, and so on."""
+DELETE = 2
+"""Value of `action` of a marker that deletes the earlier one. That of a marker that replaces it is 0."""
 LINE_M = 0.3
 """Width of the lines of loops, in metres."""
 
@@ -110,11 +112,13 @@ def edge_message(edge: LoopEdge) -> bytes:
 
 
 def marker_message(ends: Sequence[Float[np.ndarray, "2 3"]], *, time: float, frame: str) -> bytes:
-    """Encode lines between the positions of the two scans of each loop as a visualization_msgs/MarkerArray."""
+    """Encode lines between the positions of the two scans of each loop as a visualization_msgs/MarkerArray. Without
+    loops, the message deletes earlier lines."""
     marker = {
         "header": header(time, frame),
         "ns": "loops",
         "type": LINE_LIST,
+        "action": 0 if ends else DELETE,
         "pose": {"orientation": {"w": 1.0}},
         "scale": {"x": LINE_M},
         "color": {"r": 0.1, "g": 0.8, "b": 0.2, "a": 1.0},

@@ -176,7 +176,8 @@ class RosSink:
         self._publish_markers = transport.advertise(f"{prefix}/loop_markers", MARKERS, depth=1, latched=True)
         self._publish_transform = transport.advertise("/tf", TRANSFORMS, depth=100, latched=False)
         self._loop_ends: deque[np.ndarray] = deque(maxlen=MAX_DRAWN_LOOPS)
-        """Positions (2, 3) of match and query of the last loops, in metres in the frame of the odometry."""
+        """Positions (2, 3) of match and query of the last loops, in metres in the odometry frame of the last loop."""
+        self._odometry_frame = 0  # `LoopEdge.odometry_frame` of the last loop
 
     def frame(self, status: FrameStatus) -> None:
         """Publish the transform from map to odometry at the time of the scan, or now if the scan has no time."""
@@ -187,11 +188,18 @@ class RosSink:
         self._publish_transform(transform_message(status.map_from_world, time=stamp, **frames))
 
     def loop(self, edge: LoopEdge) -> None:
-        """Publish an edge. If both scans have odometry, publish the lines of the latest loops, too."""
+        """Publish an edge. Publish the lines of the latest loops, too, if both scans have odometry or if the odometry
+        frame has changed. Lines in an earlier odometry frame are deleted."""
         self._publish_edge(edge_message(edge))
         query_pose, match_pose = edge.world_from_query, edge.world_from_match
+        has_changed = edge.odometry_frame != self._odometry_frame
+        if has_changed:
+            self._odometry_frame = edge.odometry_frame
+            self._loop_ends.clear()
         if query_pose is not None and match_pose is not None:
             self._loop_ends.append(np.stack([match_pose[:3, 3], query_pose[:3, 3]]))
+            has_changed = True
+        if has_changed:
             frame = self._options.odometry_frame
             self._publish_markers(marker_message(list(self._loop_ends), time=edge.query_time, frame=frame))
 

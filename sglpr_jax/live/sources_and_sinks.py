@@ -1,12 +1,12 @@
 """Sources of scans and sinks of loops for the live node: what each must implement, and how one is opened by name.
 
-The module `live/NAME.py` is imported when it is used. It has `open_source(where, options, report, is_in_map)`,
+The module `live/NAME.py` is imported when it is used. It has `open_source(where, options, report, map_names)`,
 `open_sink(where, options, report)` or, for a connection to ROS, `open_transport(where, report)`. To support another
 source or sink, add a module and its name.
 """
 
 import importlib
-from collections.abc import Callable, Iterator
+from collections.abc import Collection, Iterator
 from types import ModuleType
 from typing import Protocol, runtime_checkable
 
@@ -19,8 +19,6 @@ SINKS = {"json": None, "dds": "live", "zenoh": "live", "rerun": "view"}
 """Names of sources and sinks, with the extra of the package that each needs."""
 TRANSPORTS = ("dds", "zenoh")
 """Connections to ROS, each a source and a sink."""
-IsInMap = Callable[[str], bool]
-"""Function that says whether a scan with this `Scan.name` is in the map already."""
 
 
 @runtime_checkable
@@ -53,15 +51,15 @@ class Sink(Protocol):
     def close(self) -> None: ...
 
 
-def open_source(text: str, options: LiveOptions, report: Report, *, is_in_map: IsInMap = lambda name: False) -> Source:
+def open_source(text: str, options: LiveOptions, report: Report, *, map_names: Collection[str] = ()) -> Source:
     """Open the source that a text names: `NAME` or `NAME:WHERE`, such as `folder:my_scans`.
 
-    `report` receives errors of single scans and messages. Scans of files for which `is_in_map` is true are skipped.
-    Raises ValueError if no source has this name, and ImportError if its extra is not installed.
+    `report` receives errors of single scans and messages. Scans of files are skipped up to the last one whose name is
+    in `map_names`. Raises ValueError if no source has this name, and ImportError if its extra is not installed.
     """
     name, where, module = named_module(text, SOURCES, kind="sources")
     if name not in TRANSPORTS:
-        return module.open_source(where, options, report, is_in_map)
+        return module.open_source(where, options, report, map_names)
     from sglpr_jax.live.ros_topics import RosSource  # needs the same extra
 
     return RosSource(module.open_transport(where, report), options, report)

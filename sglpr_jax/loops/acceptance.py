@@ -4,14 +4,22 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from scipy.sparse.csgraph import connected_components
 
 from sglpr_jax.data.choices import Scale
-from sglpr_jax.data.mounting import upright_from_lidar
+from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.files import warn
-from sglpr_jax.loops.closure import UNKNOWN_HEIGHT_M, LoopClosure, Reason, RejectedClosure, frames_of
+from sglpr_jax.loops.closure import (
+    UNKNOWN_HEIGHT_M,
+    LoopClosure,
+    Reason,
+    RejectedClosure,
+    frames_of,
+    to_lidar,
+    to_upright,
+)
 from sglpr_jax.loops.consistency import are_consistent, largest_consistent_set
 from sglpr_jax.loops.frame_alignment import logarithm
 from sglpr_jax.loops.odometry_deviation import deviations
@@ -123,24 +131,33 @@ def register_loops(
     for number, loop in enumerate(loops):
         if should_stop():
             return [*accepted, *loops[number:]], rejected
-        query, match = queries.points(loop.query), matches.points(loop.match)
+        query, query_rotation = _rotated_upright(queries, loop.query)
+        match, match_rotation = _rotated_upright(matches, loop.match)
+        rotations = {"query": query_rotation, "match": match_rotation}
+        upright = to_upright(loop, **rotations)
         try:
-            registration = register(query, match, initial=loop.match_from_query, initial_covariance=loop.covariance)
+            options = {"initial": upright.match_from_query, "initial_covariance": upright.covariance}
+            registration = register(query, match, **options)
         except ValueError:  # too few points
             rejected.append(RejectedClosure(dataclasses.replace(loop, overlap=0.0), "little overlap"))
             continue
-        covariance = registration.covariance
         if not knows_height:  # registration does not tell equal storeys apart
-            up = np.zeros(6)
-            up[:3] = upright_from_lidar(queries.mounting_of(loop.query))[2, :3]
-            covariance = covariance + UNKNOWN_HEIGHT_M**2 * np.outer(up, up)
-        registered = dataclasses.replace(loop, **registration._replace(covariance=covariance)._asdict())
-        overlap = registration.overlap
-        if overlap >= MIN_OVERLAP or (overlap >= LITTLE_OVERLAP and registration_agrees(registered, loop)):
-            accepted.append(registered)
+            registration.covariance[2, 2] += UNKNOWN_HEIGHT_M**2
+        overlap, registered = registration.overlap, dataclasses.replace(upright, **registration._asdict())
+        if overlap >= MIN_OVERLAP or (overlap >= LITTLE_OVERLAP and registration_agrees(registered, upright)):
+            accepted.append(to_lidar(registered, **rotations))
         else:
-            rejected.append(RejectedClosure(registered, "little overlap"))
+            rejected.append(RejectedClosure(to_lidar(registered, **rotations), "little overlap"))
     return accepted, rejected
+
+
+def _rotated_upright(recording: Recording, row: int) -> tuple[Float32[np.ndarray, "n 3"], Mounting | None]:
+    """Points of a scan, rotated about the sensor to be gravity-aligned, and a mounting that stands for the rotation."""
+    points, mounting = recording.points(row), recording.mounting_of(row)
+    if mounting is None:
+        return points, None
+    rotation = dataclasses.replace(mounting, height_m=MODEL_HEIGHT_M)  # at this height, points are not shifted
+    return rotation.level(points), rotation
 
 
 def registration_agrees(registered: LoopClosure, loop: LoopClosure) -> bool:

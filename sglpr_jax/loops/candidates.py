@@ -322,7 +322,6 @@ class CandidateSearch:
         The registration `link` of an earlier run (`is_known`) is not repeated.
         """
         if query is None or not self.odometry_check.is_due(pose):
-            self.odometry_check.skip()
             return None
         if not is_known and self._checked is not None:
             link, _ = self._register(query, self._checked, NO_PRIOR)

@@ -6,6 +6,7 @@ All results that take time are stored: descriptors, images, and comparisons with
 import dataclasses
 import hashlib
 import json
+import shutil
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -122,10 +123,8 @@ def settings(
 
 
 def delete_checkpoint(folder: Path) -> None:
-    """Delete the checkpoint in a folder, and the folder if it is then empty."""
-    (folder / LOG).unlink(missing_ok=True)
-    if folder.is_dir() and not any(folder.iterdir()):
-        folder.rmdir()
+    """Delete the folder of a checkpoint, with everything in it. The folder must be the command's own."""
+    shutil.rmtree(folder)
 
 
 def add_scans(

@@ -82,11 +82,6 @@ class LoopClosure:
         """The inverse of the covariance."""
         return np.linalg.inv(self.covariance)
 
-    @property
-    def is_degenerate(self) -> bool:
-        """Whether the position is uncertain by more than `DEGENERATE_M` in some horizontal direction."""
-        return bool(np.linalg.eigvalsh(self.covariance[:2, :2])[-1] > DEGENERATE_M**2)
-
 
 def to_upright(loop: LoopClosure, *, query: Mounting | None, match: Mounting | None) -> LoopClosure:
     """Convert a loop between LiDAR frames to one between gravity-aligned frames, by the mountings of both sensors."""

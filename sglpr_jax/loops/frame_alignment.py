@@ -26,7 +26,7 @@ class TrajectorySegment(NamedTuple):
     session: int
     first: int
     last: int
-    """First and last scan of the segment."""
+    """Numbers of the first and the last scan of the segment (`Recording.numbers`)."""
     is_odometry: bool
     """Whether the frame is that of the odometry. Otherwise it is the LiDAR's frame at the first scan."""
 

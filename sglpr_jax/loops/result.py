@@ -8,13 +8,15 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import Scale
+from sglpr_jax.data.mounting import upright_from_lidar
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.loops.closure import MEANING, LoopClosure, RejectedClosure, convert_rejected, count_reasons
+from sglpr_jax.loops.closure import DEGENERATE_M, MEANING, LoopClosure, RejectedClosure, convert_rejected, count_reasons
 from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import MIN_CELLS, DetectorConfig
 from sglpr_jax.loops.frame_alignment import SegmentAlignment
 from sglpr_jax.loops.probability import LoopModel
 from sglpr_jax.odometry.drift_model import DriftModel
+from sglpr_jax.se3 import travelled
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -114,10 +116,16 @@ class LoopSearchResult:
             rejected=tuple(convert_rejected(result.rejected, in_session_0)),
         )
 
+    def is_degenerate(self, loop: LoopClosure) -> bool:
+        """Whether the position of a loop is uncertain by more than `DEGENERATE_M` in some horizontal direction."""
+        mounting = self.sessions[loop.query_session].recording.mounting_of(loop.query)
+        horizontal = upright_from_lidar(mounting)[:2, :3]  # the two horizontal axes in the LiDAR frame
+        return bool(np.linalg.eigvalsh(horizontal @ loop.covariance[:3, :3] @ horizontal.T)[-1] > DEGENERATE_M**2)
+
     def without_degenerate(self) -> "LoopSearchResult":
         """Reject the degenerate loops. Transforms stay, because their estimation weighs loops by their covariance."""
-        loops = tuple(loop for loop in self.loops if not loop.is_degenerate)
-        degenerate = [RejectedClosure(loop, "degenerate") for loop in self.loops if loop.is_degenerate]
+        loops = tuple(loop for loop in self.loops if not self.is_degenerate(loop))
+        degenerate = [RejectedClosure(loop, "degenerate") for loop in self.loops if self.is_degenerate(loop)]
         rejected = ordered_rejections([*self.rejected, *degenerate])
         return dataclasses.replace(self, loops=loops, rejected=tuple(rejected))
 
@@ -130,7 +138,7 @@ class LoopSearchResult:
     def _describe_session(self) -> str:
         """Describe the loops of a result with one session."""
         session = self.sessions[0]
-        degenerate = sum(loop.is_degenerate for loop in self.loops)
+        degenerate = sum(map(self.is_degenerate, self.loops))
         loops = f"{len(self.loops)} loops{f' ({degenerate} degenerate)' if degenerate else ''}"
         scans = f"{session.frames} of {len(session.recording)} frames of {session.recording.name}"
         text = f"{loops} in {scans}{f' ({session.keyframes} keyframes)' if session.keyframes < session.frames else ''}"
@@ -193,7 +201,9 @@ def diagnose_no_loops(result: LoopSearchResult) -> list[str]:
     if result.rejected:
         reason, count = next(iter(count_reasons(result.rejected).items()))  # the most frequent one
         return [*reasons, f"{len(result.rejected)} pairs were rejected. For {count} of them: {MEANING[reason]}"]
-    source = "images" if session.odometry is None else "odometry"
+    source = "images"
+    if session.odometry is not None:  # a length that contradicts the drive shows wrong odometry
+        source = f"odometry, which is {travelled(session.odometry[: session.frames])[-1]:.1f} m long"
     return [
         *reasons,
         f"No pair was possible: according to the {source}, no scan came back to a place after at least "

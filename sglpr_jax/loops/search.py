@@ -40,7 +40,6 @@ from sglpr_jax.loops.sequence import pair_of, probable_loops, rejection_reason
 from sglpr_jax.models.weights import Params
 from sglpr_jax.odometry.bev_odometry import BevOdometry
 from sglpr_jax.odometry.drift_model import DriftModel
-from sglpr_jax.registration.gicp import check_installed, is_installed
 from sglpr_jax.se3 import inverse
 
 
@@ -86,7 +85,7 @@ def find_loops(
       model: Model of the probabilities, by default the shipped one.
       config: Settings of the detector.
       registered: Register the full scans of each loop in 6 degrees of freedom. Loops with little overlap are rejected.
-        None does so if all recordings have scans, not images, and small-gicp is installed.
+        None does so if all recordings have scans, not images.
       scale: Factor for all lengths during the search, 1, 2 or 4, for places that are small in an image, such as rooms.
         Results and `config.drift` are in metres, the other settings those of scaled scans.
       on_bad_scan: Called with id and error of a scan that cannot be read. The scan is skipped and the other frames keep
@@ -102,7 +101,6 @@ def find_loops(
       ValueError: If there is no recording, if the odometry has another length or shape, if no scan can be read, or if
         all scans of a recording are empty.
       TypeError: If an argument is not a recording, parameters or an array.
-      ImportError: If `registered` is True and small-gicp is not installed.
 
     Example:
       found = find_loops(sglpr_jax.open_recording(root, "08"), sglpr_jax.load("sglpr"))
@@ -116,7 +114,7 @@ def find_loops(
         raise ValueError(f"expected recordings with odometry of each, found {counts}")
     for recording in all_recordings:
         check_is(recording, Recording, by="open_recording")
-    registered = all(map(can_register, all_recordings)) if registered is None else registered
+    registered = not any(one.has_images for one in all_recordings) if registered is None else registered
     inputs = [_check_input(*pair, registered=registered) for pair in zip(all_recordings, all_odometry, strict=True)]
     finished_steps, searched = 0, list[SearchedSession]()
     loops, rejected, transforms = list[LoopClosure](), list[RejectedClosure](), list[SegmentAlignment]()
@@ -165,11 +163,6 @@ def find_loops(
     )
 
 
-def can_register(recording: Recording) -> bool:
-    """Whether the scans of a recording can be registered: it has scans, not images, and small-gicp is installed."""
-    return not recording.has_images and is_installed()
-
-
 def _check_input(
     recording: Recording, odometry: ArrayLike | None, *, registered: bool
 ) -> tuple[Recording, Float[np.ndarray, "n 4 4"] | None]:
@@ -177,7 +170,6 @@ def _check_input(
     poses = None if odometry is None else as_scan_poses(odometry, recording, of="odometry")
     if registered:
         recording.require_scans("scans to register")
-        check_installed()
     if poses is not None:
         recording = with_odometry(recording, poses)  # levels the scans of a sensor that tilts
     return recording, poses
@@ -219,7 +211,7 @@ def _search_session(
 ) -> SearchedSession:
     """Search one session with a detector without frames. Recording and odometry are already checked and scaled.
 
-    Odometry that the images contradict is ignored: the session is then searched again without odometry.
+    Odometry that the images contradict is ignored: after the last scan, the session is searched again without odometry.
     """
     config, finder = detector.config, detector.finder
     stream = {"on_bad_scan": on_bad_scan, "should_stop": should_stop, "on_progress": on_progress}
@@ -265,7 +257,7 @@ def _search_session(
             raise ValueError(
                 f"{recording.name}: expected at least one scan that is not empty, found {len(finder)} empty ones"
             )
-    if odometry is not None and finder.odometry_check.is_unusable:
+    if odometry is not None and finder.scans == len(recording) and finder.odometry_check.is_unusable:
         length, degrees = finder.odometry_check.errors  # per metre of the scaled drive
         warn(
             f"{recording.name}: the odometry contradicts the motion between neighbouring scans and is ignored: it "
@@ -273,8 +265,9 @@ def _search_session(
             f"100 m; check that the poses belong to these scans and use these axes: {AXES}"
         )
         new_detector = LoopDetector(finder.params, model=detector.model, config=config)
-        options = {"registered": registered, "scale": scale, "kept_in": None, **stream}
-        return _search_session(recording, None, new_detector, **options)
+        options = {"registered": registered, "scale": scale, **stream}
+        kept_in = None if kept_in is None else kept_in / "without-odometry"
+        return _search_session(recording, None, new_detector, kept_in=kept_in, **options)
     loops, rejected = detector.loops, list[RejectedClosure]()
     drift = config.drift if odometry is None else finder.present_drift
     path = finder.motion.path
@@ -312,8 +305,7 @@ def _search_pair(
     mountings = [*match_finder.mountings, *query_finder.mountings]
     knows_height = match_finder.knows_height and query_finder.knows_height
     model, config = sessions[0].detector.model, sessions[0].detector.config
-    drifts = match_finder.present_drift, query_finder.present_drift
-    drift = DriftModel(*map(max, *map(dataclasses.astuple, drifts)))  # the larger one of each number
+    drift = DriftModel.largest(match_finder.present_drift, query_finder.present_drift)
     options = {"should_stop": should_stop, "on_progress": on_progress}
     candidates = _candidates_between(match_finder, query_finder, motion, drift, **options)
     pairs = [pair_of(candidate, model, motion, mountings, knows_height=knows_height) for candidate in candidates]
@@ -395,7 +387,8 @@ def _align_segments(
         frames, segment_of_scan = np.searchsorted(finder.rows, scans), finder.segments_of(scans)
         frames_of_scans[node.session] = frames
         first, last = np.flatnonzero(segment_of_scan == segment_of_scan[node.frame])[[0, -1]].tolist()
-        segments.append(TrajectorySegment(node.session, first, last, odometry is not None))
+        numbers = searched.recording.numbers
+        segments.append(TrajectorySegment(node.session, int(numbers[first]), int(numbers[last]), odometry is not None))
         if odometry is None:
             lidar_poses = finder.motion.poses @ searched.recording.uprights[finder.rows]
             poses.append(inverse(lidar_poses[frames[first]]) @ lidar_poses)

@@ -137,8 +137,8 @@ class PlaceMap(Keyframes):
         """Return the map with the places of `other`, which has the same world frame. Common places are stored once.
 
         If an id of `other` belongs to a different place here, the recordings of `other` get a suffix ~2, ~3, and so on.
-        If `other` is a part of a drive, pass the poses of all its scans as `drive` (`poses_by_id`). The suffix is then
-        that of the complete map.
+        If `other` is a part of a drive, pass the poses of all its scans as `drive`, by their ids (`place_names`). The
+        suffix is then that of the complete map.
 
         Raises ValueError if the maps were made with other weights or another scale, or have images of another size.
         """
@@ -314,11 +314,6 @@ Content = tuple[bytes | None, bytes]
 def place_names(recording: Recording) -> list[str]:
     """Return the id that each scan has as a place of a map: RECORDING/SCAN."""
     return [f"{recording.name}/{scan}" for scan in recording.ids]
-
-
-def poses_by_id(recording: Recording, poses: Float[np.ndarray, "n 4 4"]) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """Return the pose of each scan by its id as a place of a map (RECORDING/SCAN), for `PlaceMap.merged`."""
-    return dict(zip(place_names(recording), np.asarray(poses, np.float64), strict=True))
 
 
 def _unused_ids(ids: Sequence[str], drive: Mapping[str, Content], *, existing: Mapping[str, Content]) -> list[str]:

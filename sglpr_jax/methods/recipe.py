@@ -39,6 +39,11 @@ class TupleConfig:
 
     def __post_init__(self):
         check_fields(self)
+        if self.positive_m > self.negative_m:
+            raise ValueError(
+                f"expected sampling.negative_m of at least sampling.positive_m, {self.positive_m}, "
+                f"found {self.negative_m}"
+            )
         if self.mining == "none":
             return
         if self.negatives == 0 and self.cluster == 1:

@@ -53,7 +53,7 @@ def graft(source: Params, target: Params) -> Params:
     for name, value in by_name(source.weights).items():
         expected = weights[name].shape if name in weights else "no such weight"
         if value.shape != expected:
-            is_kernel = name in weights and value.ndim == len(expected) and value.ndim in (2, 4)
+            is_kernel = name.endswith("/kernel") and name in weights and value.ndim == len(expected)
             added = np.subtract(expected, value.shape) if is_kernel else np.zeros(2, np.int64)
             added_inputs = added[-2]  # inputs are the last axis but one of a kernel
             if added_inputs <= 0 or np.count_nonzero(added) > 1:
@@ -99,6 +99,14 @@ def own_hash(params: Params) -> str:
     return hash_of(by_name(descriptor_layers(params)))
 
 
+def different_fields(a: ModelConfig, b: ModelConfig) -> dict[str, tuple[Any, Any]]:
+    """Return the values of the fields that differ between two configurations, by dotted name like `head.clusters`."""
+    a_values, b_values = (flax.traverse_util.flatten_dict(dataclasses.asdict(config), sep=".") for config in (a, b))
+    names = sorted(a_values.keys() | b_values.keys())
+    values = {name: (a_values.get(name), b_values.get(name)) for name in names}
+    return {name: (a_value, b_value) for name, (a_value, b_value) in values.items() if a_value != b_value}
+
+
 def average(models: Sequence[Params], *, shares: Sequence[float] | None = None) -> Params:
     """Return the weighted mean of models whose trainings started from each other, without whitening layers.
 
@@ -113,12 +121,9 @@ def average(models: Sequence[Params], *, shares: Sequence[float] | None = None) 
     if len(shares) != len(models) or min(shares, default=0) < 0 or sum(shares) == 0:
         raise ValueError(f"expected {len(models)} shares of 0 or more, not all 0, found {shares}")
     models = [without_whitening(model) for model in models]
-    first_config, *other_configs = (by_name(dataclasses.asdict(model.config)) for model in models)
-    for config in other_configs:
-        for name in sorted(first_config.keys() | config.keys()):
-            if first_config.get(name) != config.get(name):
-                found = f"{name.replace('/', '.')} {first_config.get(name)} and {config.get(name)}"
-                raise ValueError(f"expected models with equal configurations, found {found}")
+    for model in models[1:]:
+        for name, (first, other) in different_fields(models[0].config, model.config).items():
+            raise ValueError(f"expected models with equal configurations, found {name} {first} and {other}")
     factors = [share / sum(shares) for share in shares]
 
     def mean(*arrays: Any) -> Any:

@@ -9,8 +9,8 @@ from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.se3 import inverse, yaw_of
 
-STEP_M, STEP_DEG, MOST_FRAMES = 2.5, 15.0, 20
-"""Minimum distance (metres) or angle (degrees) by odometry, or number of frames, between two compared scans."""
+STEP_M, STEP_DEG = 2.5, 15.0
+"""Minimum distance (metres) or angle (degrees) by odometry between two compared scans."""
 MAX_STEP_M = 8.0
 """Maximum distance of two compared scans by odometry, in metres. Images of farther ones share too little."""
 MAX_SECOND, MAX_ALONG_M = 0.6, 0.2
@@ -31,8 +31,6 @@ class OdometryCheck:
     def __init__(self):
         self._last_pose: Float[np.ndarray, "4 4"] | None = None
         """Pose by odometry of the last scan that was registered for this check. None if the motion since is unknown."""
-        self._frames = 0
-        """Number of scans since then."""
         self._start_window()
         self._errors: list[tuple[float, float]] = []
         """For each window, the motion by odometry minus that by images: length, and angle in degrees, per metre."""
@@ -43,7 +41,7 @@ class OdometryCheck:
 
     def is_due(self, pose: Float[np.ndarray, "4 4"]) -> bool:
         """Whether the next scan, with this pose by odometry, should be compared with the last compared one."""
-        if self._last_pose is None or self._frames + 1 >= MOST_FRAMES:
+        if self._last_pose is None:
             return True
         motion = inverse(self._last_pose) @ pose
         return bool(np.linalg.norm(motion[:3, 3]) >= STEP_M or abs(yaw_of(motion)) >= np.radians(STEP_DEG))
@@ -52,17 +50,13 @@ class OdometryCheck:
         """Note that the motion since the last scan is unknown."""
         self._last_pose = None
 
-    def skip(self) -> None:
-        """Count a scan that is not compared."""
-        self._frames += 1
-
     def add(self, pose: Float[np.ndarray, "4 4"], link: BevRegistration | None) -> None:
         """Add a compared scan: its gravity-aligned pose by odometry, and its registration with the last compared one.
 
         If the registration does not count, a new window starts.
         """
         step = None if self._last_pose is None else inverse(self._last_pose) @ pose
-        self._last_pose, self._frames = pose, 0
+        self._last_pose = pose
         is_clear = link is not None and link.peak_ratio <= MAX_SECOND and link.along_m <= MAX_ALONG_M
         if step is None or link is None or not is_clear or np.linalg.norm(step[:3, 3]) > MAX_STEP_M:
             self._start_window()

@@ -35,6 +35,11 @@ class DriftModel:
         """Raises ValueError if a drift is negative or not finite, or if another number is not positive."""
         check_fields(self)
 
+    @classmethod
+    def largest(cls, *drifts: "DriftModel") -> "DriftModel":
+        """The largest value of each number of one or several models."""
+        return cls(*map(max, zip(*map(dataclasses.astuple, drifts), strict=True)))
+
     def scaled(self, factor: float) -> "DriftModel":
         """The same model with `factor` times the drift per metre."""
         names = ("metres_per_metre", "degrees_per_metre", "height_per_metre")

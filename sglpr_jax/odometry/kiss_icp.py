@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import Scale
-from sglpr_jax.data.deskew import has_point_times, poses_at
+from sglpr_jax.data.deskew import has_point_times, point_times_problem, poses_at, valid_point_times
 from sglpr_jax.data.fingerprint import fingerprint
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled, scaled_poses
@@ -34,8 +34,9 @@ MIN_OVERLAP = 0.55
 have more, scans of other places mostly less."""
 
 
-RESULT_NUMBERS = 16 + 1
-"""Numbers of a scan in the log: its pose, and the time of its last point relative to the scan, in seconds."""
+RESULT_NUMBERS = 16 + 3
+"""Numbers of a scan in the log: its pose, the time of its last point relative to the scan in seconds, its number of
+points (NaN if it is unreadable), and its overlap (`_RegisteredScan`)."""
 Cloud = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " m"]]
 """Points of a scan in metres, and the time of each point relative to the scan in seconds or an empty array."""
 
@@ -94,43 +95,42 @@ def scan_odometry(
             results = _register_scans(recording, log, logged, _FrontEnd(config), scale, **options)
         else:
             results = np.array([logged[row] for row in range(len(recording))])
+    last_point_s, points, overlap = results[:, 16:].T
+    if len(results) == len(recording):
+        _check_registration(recording, points, overlap)
     poses = scaled_poses(results[:, :16].reshape(-1, 4, 4), 1 / scale)
-    return _poses_at_scan_times(poses, recording, results[:, 16])
+    return _poses_at_scan_times(poses, recording, last_point_s)
 
 
 def _settings(recording: Recording, config: OdometryConfig, scale: Scale) -> dict[str, Any]:
-    """Settings that determine the poses. A log with other settings is not resumed."""
+    """Settings that determine the records. A log with other settings is not resumed."""
     scans = [recording.name, fingerprint(recording, contents="some")]
-    return {"scans": scans, "kiss-icp": version("kiss-icp"), "scale": scale, **dataclasses.asdict(config)}
+    versions = {"kiss-icp": version("kiss-icp"), "record length": RESULT_NUMBERS}
+    return {"scans": scans, **versions, "scale": scale, **dataclasses.asdict(config)}
 
 
 def _register_scans(
     recording: Recording,
     log: FrameLog,
-    logged: dict[int, Float[np.ndarray, "17"]],
+    logged: dict[int, Float[np.ndarray, "19"]],
     front_end: "_FrontEnd",
     scale: Scale,
     **options: Any,
-) -> Float[np.ndarray, "n 17"]:
+) -> Float[np.ndarray, "n 19"]:
     """Add all scans to kiss-icp, those of the log at their logged poses. Returns `RESULT_NUMBERS` of each scan.
 
-    New results are appended to the log. If no scan is left, doubtful scans are reported. The options are those of
-    `scan_stream`.
+    New results are appended to the log. The options are those of `scan_stream`.
     """
     is_timed = has_point_times(recording)
-    results, registered = list[np.ndarray](), dict[int, _RegisteredScan]()
+    results = list[np.ndarray]()
     for row, cloud in scan_stream(scaled(recording, scale), lambda _, scan: _cloud(scan, is_timed), **options):
         known = logged.get(row)
-        result = front_end.add(cloud, known_pose=None if known is None else known[:16].reshape(4, 4))
-        if cloud is not None:
-            registered[row] = result
+        pose, points, overlap = front_end.add(cloud, known_pose=None if known is None else known[:16].reshape(4, 4))
         if known is None:
-            known = np.append(result.pose, 0.0 if cloud is None else cloud[1].max(initial=0))
+            last_point_s, points = (0.0, np.nan) if cloud is None else (cloud[1].max(initial=0), points)
+            known = np.append(pose, [last_point_s, points, overlap])
             log.append(row, known.tobytes())
         results.append(known)
-    if len(results) == len(recording):
-        check_readable(recording, len(registered))
-        _warn_of_doubtful(recording, registered)
     return np.array(results).reshape(-1, RESULT_NUMBERS)
 
 
@@ -139,7 +139,7 @@ def _cloud(scan: Scan, is_timed: bool) -> Cloud:
     points = scan.points
     assert points is not None
     valid = np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)
-    times = scan.point_times if is_timed else None
+    times = valid_point_times(scan) if is_timed else None
     return points[valid].astype(np.float64), np.zeros(0) if times is None else times[valid].astype(np.float64)
 
 
@@ -214,30 +214,38 @@ def _poses_at_scan_times(
     return inverse(interpolated[0]) @ interpolated
 
 
-def _warn_of_doubtful(recording: Recording, registered: dict[int, _RegisteredScan]) -> None:
-    """Warn of scans with few points or little overlap. Raises ValueError if all scans have few points."""
-    few = [row for row, result in registered.items() if result.points < MIN_POINTS]
-    if len(few) == len(registered):
+def _check_registration(
+    recording: Recording, points: Float[np.ndarray, " n"], overlap: Float[np.ndarray, " n"]
+) -> None:
+    """Warn of scans with few points or little overlap. Raises ValueError if all scans have few or are unreadable.
+
+    `points` and `overlap` are those of `RESULT_NUMBERS`.
+    """
+    readable = int(np.isfinite(points).sum())
+    check_readable(recording, readable)
+    few = np.flatnonzero(points < MIN_POINTS)
+    if len(few) == readable:
         raise ValueError(
             f"sequence {recording.name}: expected scans with {MIN_POINTS} points or more for odometry, found at most "
-            f"{max(result.points for result in registered.values())} after downsampling; use --scale 4 in rooms"
+            f"{np.nanmax(points):.0f} after downsampling; use --scale 4 in rooms"
         )
-    if few:
+    if len(few):
         warn(
             f"{recording.name}: expected {MIN_POINTS} points or more in each scan, found fewer in {len(few)}, first in "
             f"scan {recording.ids[few[0]]}; their odometry is extrapolated"
         )
-    apart = [row for row, result in registered.items() if result.overlap < MIN_OVERLAP]
-    if apart:
+    apart = np.flatnonzero(overlap < MIN_OVERLAP)
+    if len(apart):
         warn(
             f"{recording.name}: expected scans that overlap the previous ones, found {len(apart)} that do not, first "
-            f"scan {recording.ids[apart[0]]} ({registered[apart[0]].overlap:.0%}); the odometry may be wrong from there"
+            f"scan {recording.ids[apart[0]]} ({overlap[apart[0]]:.0%}); the odometry may be wrong from there"
         )
 
 
 def describe_odometry(recording: Recording, config: OdometryConfig, *, scale: Scale) -> str:
     """Describe the odometry of a recording to the user: kiss-icp's version, range and voxels in metres, deskewing."""
-    deskewing = "motion within scans removed" if has_point_times(recording) else "without times of points"
+    problem = point_times_problem(recording)
+    deskewing = f"motion within scans not removed: {problem}" if problem else "motion within scans removed"
     return (
         f"odometry: kiss-icp {version('kiss-icp')}, points up to {config.max_range_m / scale:g} m, voxels of "
         f"{config.used_voxel_m / scale:g} m, {deskewing}"

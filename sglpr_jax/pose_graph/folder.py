@@ -58,17 +58,18 @@ def write_loop_folder(
     """
     folder, names, numbers, placed = Path(folder), result.unique_names, vertex_numbers(result), placements(result)
     ids, recordings = dict[int, str](), dict[int, str]()  # by vertex number
-    chains = []  # vertex numbers and poses of each session with odometry
+    chains, drifts = [], []  # vertex numbers and poses, and drift, of each session with odometry
     for name, vertices, (_, group_from_session), session in zip(names, numbers, placed, result.sessions, strict=True):
         ids |= zip(vertices.tolist(), session.recording.ids, strict=True)
         recordings |= dict.fromkeys(vertices.tolist(), name)
         if session.odometry is not None:
             chains.append((vertices[: session.frames], group_from_session @ session.odometry[: session.frames]))
+            drifts.append(session.drift)
     named: dict[str, Any] = {"ids": ids, "recordings": recordings if len(names) > 1 else None}
     loops = [renumbered(loop, numbers) for loop in result.loops]
     rejected = convert_rejected(result.rejected, lambda loop: renumbered(loop, numbers))
     comments = _comments(result, names, numbers) if len(names) > 1 else []
-    files = graph_files(loops, rejected, chains, drift=result.sessions[0].drift, comments=comments, **named)
+    files = graph_files(loops, rejected, chains, drift=drifts, comments=comments, **named)
     files[LOOPS_JSONL] = partial(write_loops_jsonl, loops=loops, **named)
     if len(names) > 1:
         files[FRAMES] = partial(write_json, value=_frames_json(result, names, numbers))
@@ -88,7 +89,7 @@ def graph_files(
     rejected: Sequence[RejectedClosure],
     chains: Sequence[tuple[Int[np.ndarray, " _"], Float[np.ndarray, "_ 4 4"]]],
     *,
-    drift: DriftModel,
+    drift: DriftModel | Sequence[DriftModel],
     comments: Sequence[str] = (),
     ids: Ids | None = None,
     recordings: Ids | None = None,
@@ -124,9 +125,8 @@ def _frames_json(
 
     def describe_frame(segment: TrajectorySegment) -> dict[str, Any]:
         """Return the name of a segment's frame, and the first and the last scan with a pose in this frame."""
-        scans = result.sessions[segment.session].recording.numbers
-        first, last = int(scans[segment.first]), int(scans[segment.last])
-        return {"frame": "odometry" if segment.is_odometry else f"LiDAR at scan {first}", "first": first, "last": last}
+        frame = "odometry" if segment.is_odometry else f"LiDAR at scan {segment.first}"
+        return {"frame": frame, "first": segment.first, "last": segment.last}
 
     recordings = [
         {"name": name, "scans": session.frames, "first_vertex": int(vertices[0] - session.recording.numbers[0])}

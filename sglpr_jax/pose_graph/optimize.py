@@ -15,7 +15,7 @@ from sglpr_jax.data.mounting import is_tilted
 from sglpr_jax.files import warn
 from sglpr_jax.loops.closure import LoopClosure, frames_of, renumbered, to_upright
 from sglpr_jax.loops.odometry_deviation import deviations, step_deviations
-from sglpr_jax.loops.result import LoopSearchResult, Session
+from sglpr_jax.loops.result import LoopSearchResult
 from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.odometry.path import DrivenPath
 from sglpr_jax.pose_graph.factor_graph import FactorGraph, gtsam_library
@@ -79,7 +79,6 @@ def optimize_trajectory(result: LoopSearchResult) -> OptimizedTrajectory:
     for session in result.sessions:
         if session.odometry is None:
             raise ValueError(f"{session.recording.name}: expected loops found with odometry, found loops without it")
-    measures_height = all(loop.overlap is not None for loop in result.loops)
     placed = placements(result)
     poses: dict[int, np.ndarray] = {}  # by session
     inliers = np.zeros(len(result.loops), bool)
@@ -91,9 +90,6 @@ def optimize_trajectory(result: LoopSearchResult) -> OptimizedTrajectory:
         solutions.append(solution)
         inliers[rows] = solution.inliers
         poses |= solved_poses
-        if not measures_height:
-            for session, corrected in solved_poses.items():
-                _warn_of_height_change(result.sessions[session], members[session], corrected)
     squared_m2 = sum(solution.moved_rms_m**2 * len(solution.poses) for solution in solutions)
     return OptimizedTrajectory(
         poses=np.concatenate([poses[session] for session in range(len(result.sessions))]),
@@ -101,7 +97,7 @@ def optimize_trajectory(result: LoopSearchResult) -> OptimizedTrajectory:
         moved_m=max(solution.moved_m for solution in solutions),
         moved_rms_m=float(np.sqrt(squared_m2 / max(sum(len(solution.poses) for solution in solutions), 1))),
         deviation=max(solution.deviation for solution in solutions),
-        drift=solutions[0].drift,
+        drift=DriftModel.largest(*(solution.drift for solution in solutions)),
     )
 
 
@@ -132,8 +128,12 @@ def _solve_group(
         match, query = (sessions[node.session].recording.mounting_of(node.frame) for node in loop.nodes)
         upright_loops.append(to_upright(loop, query=query, match=match))
     levelled = {k: level_from_first @ poses for k, poses in upright.items()}
-    solution = solve_pose_graph(levelled, upright_loops, sessions[first].drift)
+    drift = DriftModel.largest(*(sessions[k].drift for k in members))
+    solution = solve_pose_graph(levelled, upright_loops, drift)
     session_poses = np.split(solution.poses, np.cumsum([len(poses) for poses in upright.values()])[:-1])
+    if any(loop.overlap is None for loop in loops):
+        for k, corrected in zip(members, session_poses, strict=True):
+            _warn_of_height_change(sessions[k].recording.name, levelled[k], corrected)
     first_from_level = inverse(level_from_first)
     lidar_poses = {
         k: first_from_level @ poses @ upright_from_lidar[k] for k, poses in zip(members, session_poses, strict=True)
@@ -142,14 +142,14 @@ def _solve_group(
 
 
 def _warn_of_height_change(
-    session: Session, first_from_session: Float[np.ndarray, "4 4"], corrected: Float[np.ndarray, "n 4 4"]
+    name: str, odometry: Float[np.ndarray, "n 4 4"], corrected: Float[np.ndarray, "n 4 4"]
 ) -> None:
-    """Warn if the correction moved a pose up or down by more than `MAX_HEIGHT_CHANGE_M`."""
-    odometry = first_from_session @ np.asarray(session.odometry)[: session.frames]
+    """Warn if the correction moved a pose of a recording up or down, in a level frame, by more than
+    `MAX_HEIGHT_CHANGE_M`."""
     height_change_m = np.abs(corrected - odometry)[:, 2, 3].max(initial=0)
     if height_change_m > MAX_HEIGHT_CHANGE_M:
         warn(
-            f"{session.recording.name}: expected heights near those of the odometry, found them moved by up to "
+            f"{name}: expected heights near those of the odometry, found them moved by up to "
             f"{height_change_m:.1f} m; only registered loops measure heights, and some are not registered"
         )
 
@@ -162,7 +162,7 @@ def placements(result: LoopSearchResult) -> tuple[tuple[int, Float[np.ndarray, "
     """
     links = []
     for aligned in sorted(result.transforms, key=lambda aligned: -aligned.loops):  # the most reliable first
-        if aligned.match.is_odometry:
+        if aligned.match.is_odometry and aligned.query.is_odometry:
             match, query, pose = aligned.match.session, aligned.query.session, aligned.match_from_query
             links += [(match, query, pose), (query, match, inverse(pose))]
     placed: dict[int, tuple[int, np.ndarray]] = {}

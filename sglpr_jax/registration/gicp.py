@@ -1,6 +1,6 @@
-"""Registration of two scans in 6 degrees of freedom: GICP, and KISS-Matcher (extra `slam`) for a first guess.
+"""Registration of two scans in 6 degrees of freedom by GICP, from a first guess.
 
-Neither method detects whether the scans show one place. If GICP starts 3 m off along a road, its result is 3 m off,
+GICP does not detect whether the scans show one place. If it starts 3 m off along a road, its result is 3 m off,
 too. The overlap of the registered scans shows such errors.
 
 Points on one surface, ring or vehicle have correlated errors. For the covariance, their contributions are summed in
@@ -8,18 +8,16 @@ blocks of space, and the scatter of the blocks gives the noise (a sandwich estim
 simulated drives with 64, 32 and 16 beams (`benchmarks/quality/poses.py`).
 """
 
-import importlib.util
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
+import small_gicp
 from jaxtyping import Float, Float32, Int
 
-from sglpr_jax.extras import optional_module
 from sglpr_jax.se3 import transformed
 
-COARSE_VOXEL_M, VOXEL_M = 1.0, 0.25
-"""Edge lengths of the voxels of KISS-Matcher and of GICP, in metres."""
+VOXEL_M = 0.25
+"""Edge length of the voxels of GICP, in metres."""
 NEIGHBOURS = 20
 """Number of neighbours from which the normal of a point is estimated. With 10, normals on the rings of 16 beams are
 arbitrary, and GICP aligns the rings of the two scans: roll and pitch were 0.3 degrees off."""
@@ -41,8 +39,6 @@ FLAT_COSINE, LINE = 0.9, 0.05
 neighbours that lie on a line."""
 SLIDING = 0.04
 """Share of the squared components of all normals along a direction, below which scans can slide along it."""
-UNKNOWN_M = 3.0
-"""Standard deviation along a degenerate direction if the first guess has no covariance, in metres."""
 LEAST_POSITION_M, LEAST_ROTATION_DEG = 0.002, 0.005
 """Standard deviations added to every covariance, in metres and degrees."""
 
@@ -51,7 +47,7 @@ class Registration(NamedTuple):
     """Pose of a query in the frame of a match, with covariance and overlap."""
 
     match_from_query: Float[np.ndarray, "4 4"]
-    """Pose of the query's LiDAR in the frame of the match's LiDAR, in metres."""
+    """Pose of the query in the frame of the match, in metres."""
     covariance: Float[np.ndarray, "6 6"]
     """Covariance of a small motion of the query in its own frame: x, y, z in metres, then rotations about x, y, z in
     radians."""
@@ -63,33 +59,25 @@ def register(
     query: Float32[np.ndarray, "n 3"],
     match: Float32[np.ndarray, "m 3"],
     *,
-    initial: Float[np.ndarray, "4 4"] | None = None,
-    initial_covariance: Float[np.ndarray, "6 6"] | None = None,
+    initial: Float[np.ndarray, "4 4"],
+    initial_covariance: Float[np.ndarray, "6 6"],
 ) -> Registration:
     """Register the scan of a query to the scan of a match.
 
     Arguments:
-      query: Points of the query in the LiDAR frame, in metres.
-      match: Points of the match in the LiDAR frame, in metres.
-      initial: First guess of `match_from_query`, within a metre and a few degrees. Without it KISS-Matcher computes
-        one, which takes half a second.
+      query: Points of the query in a gravity-aligned frame of its sensor, in metres.
+      match: The same for the match. The covariance treats height and ground differently, so z must point up.
+      initial: First guess of `match_from_query`, within a metre and a few degrees.
       initial_covariance: Covariance of the first guess, of a small motion of the query in its own frame. The result
         keeps it along directions in which the scans can slide on each other, as in a tunnel.
 
     Raises:
-      ImportError: If small-gicp or, without `initial`, KISS-Matcher is not installed.
       ValueError: If a scan has fewer than 100 finite points.
-
-    Example:
-      registration = register(recording.points(52), recording.points(4501))
-      registration.overlap >= 0.6  # it is a loop
     """
-    gicp = _library("small_gicp")
     query, match = _finite(query, "query"), _finite(match, "match")
-    initial = coarse_pose(query, match) if initial is None else initial
     match_cloud, match_tree = _preprocess(match)
     query_cloud, _ = _preprocess(query)
-    result = gicp.align(
+    result = small_gicp.align(
         match_cloud,
         query_cloud,
         match_tree,
@@ -104,15 +92,6 @@ def register(
     covariance = _registration_covariance(information, query_cloud, match_cloud, match_tree, pose, initial_covariance)
     least = np.repeat([LEAST_POSITION_M, np.radians(LEAST_ROTATION_DEG)], 3) ** 2
     return Registration(pose, covariance + np.diag(least), overlap(query, match, pose))
-
-
-def coarse_pose(query: Float32[np.ndarray, "n 3"], match: Float32[np.ndarray, "m 3"]) -> Float[np.ndarray, "4 4"]:
-    """Estimate `match_from_query` with KISS-Matcher, without a first guess. Raises ImportError without extra `slam`."""
-    matcher = _library("kiss_matcher")
-    result = matcher.KISSMatcher(matcher.KISSMatcherConfig(COARSE_VOXEL_M)).estimate(query, match)
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = result.rotation, result.translation
-    return pose
 
 
 def overlap(
@@ -136,7 +115,7 @@ def overlap(
 def _preprocess(cloud: Float32[np.ndarray, "n 3"]) -> tuple[Any, Any]:
     """Downsample a cloud and estimate the covariance of the surface at each point. Returns cloud and search tree."""
     options = {"downsampling_resolution": VOXEL_M, "num_neighbors": NEIGHBOURS}
-    return _library("small_gicp").preprocess_points(cloud.astype(np.float64), **options)
+    return small_gicp.preprocess_points(cloud.astype(np.float64), **options)
 
 
 def _finite(points: Float32[np.ndarray, "n 3"], name: str) -> Float32[np.ndarray, "n 3"]:
@@ -153,7 +132,7 @@ def _registration_covariance(
     match: Any,
     tree: Any,
     match_from_query: Float[np.ndarray, "4 4"],
-    initial_covariance: Float[np.ndarray, "6 6"] | None,
+    initial_covariance: Float[np.ndarray, "6 6"],
 ) -> Float[np.ndarray, "6 6"]:
     """Covariance of a small motion of the query in its own frame: x, y, z in metres, then rotations in radians.
 
@@ -192,13 +171,12 @@ def _registration_covariance(
 
 
 def _sliding_covariance(
-    normals: Float[np.ndarray, "k 3"], initial_covariance: Float[np.ndarray, "6 6"] | None
+    normals: Float[np.ndarray, "k 3"], initial_covariance: Float[np.ndarray, "6 6"]
 ) -> Float[np.ndarray, "3 3"]:
     """Position covariance of the first guess along directions in which scans with these surface normals can slide."""
     squared_sums, directions = np.linalg.eigh(normals.T @ normals)
     shares = squared_sums / max(squared_sums.sum(), 1e-9)
-    guess = np.eye(3) * UNKNOWN_M**2 if initial_covariance is None else initial_covariance[:3, :3]
-    along_directions = np.einsum("ij,ik,kj->j", directions, guess, directions)
+    along_directions = np.einsum("ij,ik,kj->j", directions, initial_covariance[:3, :3], directions)
     variances = np.exp(-((shares / SLIDING) ** 2)) * along_directions
     return (directions * variances) @ directions.T
 
@@ -212,17 +190,3 @@ def _sparse_ground(cloud: Float[np.ndarray, "n 3"], tree: Any, rows: Int[np.ndar
     variances, axes = np.linalg.eigh(np.einsum("kna,knb->kab", neighbours, neighbours))
     is_flat = np.abs(axes[:, 2, 0]) > FLAT_COSINE  # z of the normal, the axis of the least variance
     return float(np.mean(variances[is_flat, 1] < LINE * variances[is_flat, 2])) if is_flat.any() else 1.0
-
-
-def is_installed() -> bool:
-    """Whether small-gicp is installed, which `register` needs if it has a first guess."""
-    return importlib.util.find_spec("small_gicp") is not None
-
-
-def check_installed() -> None:
-    """Raise ImportError if small-gicp is not installed, before any long work starts."""
-    _library("small_gicp")
-
-
-def _library(name: str) -> ModuleType:
-    return optional_module(name, "registration of scans", extra="slam")

@@ -9,7 +9,7 @@ import jax
 
 from sglpr_jax.data.readers import recording_names
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.methods.method import LABELLED, Takes
+from sglpr_jax.data.scan_stream import require_content
 from sglpr_jax.methods.registry import handcrafted, method_with_weights
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, FULL
 from sglpr_jax.reproduce.reproduction import Reproduction, content_of
@@ -57,9 +57,10 @@ def check_inputs(reproduction: Reproduction, names: Sequence[str], nclt: Path | 
                 f"{name} is about semantics: expected a preset that trains a segmentation head, found "
                 f"{reproduction.preset}"
             )
+        reads_labels = any(reproduction.config_of(variant).model.categories_read for variant in experiment.variants)
         for seq in recordings if experiment.needs_labels else ():
-            if not reproduction.recording(seq).has_labels:
-                raise ValueError(f"{name} is about semantics: expected labels in sequence {seq} of {data}, found none")
+            title = f"{name} is about semantics and"
+            require_content(title, "labelled images", reproduction.recording(seq), every_label=reads_labels)
     if len(variants_only) < len(experiments):
         _check_methods(reproduction)
 
@@ -69,23 +70,17 @@ def _check_methods(reproduction: Reproduction) -> None:
     for name in reproduction.methods:
         handcrafted(name, None)  # raises an error if the name is unknown
     for flag, names in (("--method", reproduction.methods), ("--weights", reproduction.weights)):
-        missing = {name: needs for name in names if (needs := _missing_input(reproduction, content_of(name)))}
-        if missing:
-            usable = " ".join([flag, *(name for name in names if name not in missing)])
-            raise ValueError(
-                "; ".join([*(f"{name} needs {needs}" for name, needs in missing.items()), f"use {usable}"])
-            )
-
-
-def _missing_input(reproduction: Reproduction, takes: Takes) -> str:
-    """Return what a test recording lacks, or an empty text. `takes` is what a method needs."""
-    for seq in reproduction.seqs:
-        recording = reproduction.recording(seq)
-        if takes.endswith("points") and recording.has_images:
-            return f"points, found images in sequence {seq}"
-        if takes in LABELLED and not recording.has_labels:
-            return f"labels, found none in sequence {seq}"
-    return ""
+        errors: dict[str, str] = {}
+        for name in names:
+            takes = content_of(name)
+            try:
+                for seq in reproduction.seqs:
+                    require_content(name, takes, reproduction.recording(seq))
+            except ValueError as error:
+                errors[name] = str(error).partition("; use ")[0]  # the advice below is for all methods
+        if errors:
+            usable = " ".join([flag, *(name for name in names if name not in errors)])
+            raise ValueError("; ".join([*errors.values(), f"use {usable}"]))
 
 
 class Plan(NamedTuple):

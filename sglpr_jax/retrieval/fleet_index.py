@@ -41,27 +41,22 @@ class FleetIndex:
             import lancedb
 
             self._connection = lancedb.connect(self.address, read_consistency_interval=timedelta(0), **options)
-            self.table: Any = None  # until the first `add`
-            if TABLE in self._connection.list_tables().tables:
-                try:
-                    self.table = self._connection.open_table(TABLE)
-                except ValueError as error:  # another process creates it: its folder is there before its first version
-                    if "was not found" not in str(error):
-                        raise
-        if self.table is not None:
-            self._check(self.about)
+        self.table: Any = None  # until the first `add` of any process
+        self._open()
 
     def __len__(self) -> int:
+        self._open()
         with storage_errors(self.address):
             return 0 if self.table is None else self.table.count_rows()
 
     @property
     def about(self) -> dict[str, Any]:
         """Width, scale and hash of the weights of the places."""
-        return about_of(self.table.schema, self.address)
+        return about_of(self._opened().schema, self.address)
 
     def add(self, rows: "pyarrow.Table") -> int:
         """Add the rows of `place_rows` or of a Parquet file, all or none. Returns the number of rows that were new."""
+        self._open()
         self._check(about_of(rows.schema, "rows"))
         with storage_errors(self.address):
             if self.table is None:
@@ -92,13 +87,12 @@ class FleetIndex:
         Returns:
           Columns `place` (recording/scan), `query` (row of the query) and `distance`, nearest first.
         """
-        if self.table is None:
-            raise ValueError(f"{self.address}: expected an index with places, found none")
-        queries = descriptor_rows(descriptors, self.table.schema.field("descriptor").type.list_size)
+        table = self._opened()
+        queries = descriptor_rows(descriptors, table.schema.field("descriptor").type.list_size)
         check_result_count(k, queries=len(queries), places=k)
         with storage_errors(self.address):
             vectors = list(queries) if len(queries) > 1 else queries[0]
-            search = self.table.search(vectors, vector_column_name="descriptor")
+            search = table.search(vectors, vector_column_name="descriptor")
             search = search.distance_type("l2").select([KEY, *columns, "_distance"]).limit(k)
             search = search.where(where, prefilter=True) if where else search
             search = search.bypass_vector_index() if probes is None else search.nprobes(probes).refine_factor(refine)
@@ -109,17 +103,41 @@ class FleetIndex:
         return answers.sort_by([("query", "ascending"), ("distance", "ascending"), (KEY, "ascending")])
 
     def optimize(self, config: Any = None) -> None:
-        """Merge small files and add new places to the indexes of the columns. If there are no indexes, or with a
-        `config` of LanceDB for the index of descriptors, they are trained first."""
+        """Train an index for each column that has none, merge small files, and add new places to the indexes. With a
+        `config` of LanceDB for the index of descriptors, all indexes are trained again."""
         from lancedb.index import Bitmap, BTree, IvfSq
 
-        columns = {KEY: BTree(), "recording": BTree(), "time": BTree(), "site": Bitmap()}
+        table, columns = self._opened(), {KEY: BTree(), "recording": BTree(), "time": BTree(), "site": Bitmap()}
         with storage_errors(self.address):
-            if config is not None or not self.table.list_indices():
-                indexes = columns | {"descriptor": config or IvfSq(distance_type="l2")}
-                for name, index in indexes.items():
-                    self.table.create_index(name, config=index)
-            self.table.optimize()
+            trained = {column for index in table.list_indices() for column in index.columns}
+            indexes = columns | {"descriptor": config or IvfSq(distance_type="l2")}
+            for name, index in indexes.items():
+                if config is not None or name not in trained:
+                    table.create_index(name, config=index)
+            table.optimize()
+
+    def _open(self) -> None:
+        """Open the table if a process has created it. Raises ValueError if it has other weights than `weights_hash`."""
+        if self.table is not None:
+            return
+        with storage_errors(self.address):
+            if TABLE not in self._connection.list_tables().tables:
+                return
+            try:
+                table = self._connection.open_table(TABLE)
+            except ValueError as error:  # another process creates it: its folder is there before its first version
+                if "was not found" not in str(error):
+                    raise
+                return
+        self._check(about_of(table.schema, self.address))
+        self.table = table
+
+    def _opened(self) -> Any:
+        """Return the table. Raises ValueError if no process has added places."""
+        self._open()
+        if self.table is None:
+            raise ValueError(f"{self.address}: expected an index with places, found none")
+        return self.table
 
     def _check(self, about: dict[str, Any]) -> None:
         """Raise ValueError if places have another width, scale or weights than the table, or than `weights_hash`."""

@@ -12,11 +12,11 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.formats.pose_files import read_kitti, read_times
-from sglpr_jax.se3 import yaw_of
+from sglpr_jax.se3 import lengths_along, yaw_of
 from sglpr_jax.sim import RATE_HZ
 from sglpr_jax.sim.ground import Relief, relief_gradient, relief_height
 from sglpr_jax.sim.objects import Range
-from sglpr_jax.sim.routes import ROLES, STEP_M, Line, lengths_along, plan_route
+from sglpr_jax.sim.routes import ROLES, STEP_M, Line, plan_route
 
 PATH_HZ = 10.0  # approximate number of poses per second along the path, of which the scans use some
 SHORTEST_S = 60.0  # minimum duration of a drive, in seconds, which allows revisits after 30 s

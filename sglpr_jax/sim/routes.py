@@ -13,6 +13,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
+from sglpr_jax.se3 import lengths_along
+
 STEP_M = 0.5  # distance between two points of a route's line, in metres
 BLOCKS_PER_LOOP = 12  # minimum number of streets for each loop of a route
 ROUNDABOUT_RADIUS_M = 10.0
@@ -78,11 +80,6 @@ def plan_route(rng: np.random.Generator, role: Role, *, blocks: int, days: int =
     walk = plan_days(rng, role, blocks=blocks, days=days)
     corners = resampled(_line(rng, role, np.array(walk)), STEP_M)
     return resampled(gaussian_filter1d(corners, role.corner_m / STEP_M, axis=0, mode="nearest"), STEP_M)
-
-
-def lengths_along(line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    """Length of a line up to each of its points."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
 
 
 def resampled(line: Float[np.ndarray, "n 2"], step_m: float) -> Float[np.ndarray, "m 2"]:

@@ -8,9 +8,10 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy.ndimage import binary_dilation, gaussian_filter1d
 from scipy.spatial import KDTree
 
+from sglpr_jax.se3 import lengths_along
 from sglpr_jax.sim.ground import CELL_M, Ground, Relief
 from sglpr_jax.sim.labels import LANE_MARKING, OTHER_GROUND, ROAD, TERRAIN
-from sglpr_jax.sim.routes import Line, lengths_along
+from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.styles import STYLES, TOWN, Scenery, Side, draw_side
 
 MIDDLE_M = 1.2  # distance from the first pass to the middle of the street on its left, in metres

@@ -44,9 +44,6 @@ SAVE_EVERY_S, REPORT_EVERY_S = 60.0, 30.0
 PLACES_IN_MEMORY = 256
 """Number of places whose inputs are in memory at a time."""
 
-ScoreFn = Callable[[Variables], dict[str, float]]
-"""Scores weights. The entry `recall_at_1` selects the best ones."""
-
 
 @dataclasses.dataclass(frozen=True)
 class RunSettings:
@@ -61,6 +58,22 @@ class RunSettings:
 
     def __post_init__(self):
         check_fields(self)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ScoreFn:
+    """Scores weights of a method on held-out recordings, which have revisits."""
+
+    method: LearnedMethod
+    held_out: TrainingInputs
+
+    def __call__(self, variables: Variables) -> dict[str, float]:
+        """Return `recall_at_1 NAME` for each recording, and the mean `recall_at_1`, which selects the best weights."""
+        distance, recalls = learned_distance(self.method, variables), {}
+        for recording, inputs in zip(self.held_out.recordings, self.held_out.inputs, strict=True):
+            descriptors, positions = describe_inputs(self.method, variables, inputs), positions_of(recording)
+            recalls[f"{RECALL} {recording.name}"] = recall_at_1(descriptors, positions, recording.times, distance)
+        return {RECALL: float(np.mean(list(recalls.values()))), **recalls}
 
 
 class PeerBatch(NamedTuple):
@@ -163,7 +176,7 @@ def train_learned(
 
     recipe = dataclasses.asdict(method.recipe)
     del recipe["learning_rates"]  # the settings have the learning rate of this run
-    recordings = [{"name": recording.name, "scans": len(recording)} for recording in data.recordings]
+    recordings = _names_and_sizes(data)
     config = {"method": method.name, "settings": settings_json, "recipe": recipe, "recordings": recordings}
     lock = lock_run(out, config, seed=settings.seed, resume=resume, limits=LIMITS)
     with lock, progress(f"train {method.name}", math.ceil(settings.seconds)) as show:
@@ -239,21 +252,15 @@ def _peer_batches(network: PeerNetwork, data: TrainingInputs, pool: TuplePool, o
     return TupleBatches(data.recordings, pool, read, seed=network.seed, tuples=tuples, describe=describe, run=out)
 
 
+def _names_and_sizes(data: TrainingInputs) -> list[dict[str, Any]]:
+    """Return name and number of scans of each recording, for JSON."""
+    return [{"name": recording.name, "scans": len(recording)} for recording in data.recordings]
+
+
 def held_out_score(method: LearnedMethod, held_out: TrainingInputs) -> ScoreFn:
-    """Return a function that scores weights on held-out recordings.
-
-    The entries are `recall_at_1 NAME` for each recording and the mean, `recall_at_1`. Each recording needs revisits.
-    """
+    """Return the score of a method on held-out recordings. Raises ValueError if a recording has no revisits."""
     require_revisits(held_out.recordings)
-
-    def score(variables: Variables) -> dict[str, float]:
-        distance, recalls = learned_distance(method, variables), {}
-        for recording, inputs in zip(held_out.recordings, held_out.inputs, strict=True):
-            descriptors, positions = describe_inputs(method, variables, inputs), positions_of(recording)
-            recalls[f"{RECALL} {recording.name}"] = recall_at_1(descriptors, positions, recording.times, distance)
-        return {RECALL: float(np.mean(list(recalls.values()))), **recalls}
-
-    return score
+    return ScoreFn(method, held_out)
 
 
 class Stopped(Exception):
@@ -285,9 +292,12 @@ def best_rate(
             run = train_learned(method, data, settings, folder, resume=resume, report=report, **options)
             if run.seconds < seconds:
                 raise Stopped
-            if not score_file.is_file():
-                write_json(score_file, score(variables_of(run.state)))
-            recalls[rate] = float(read_json(score_file)[RECALL])
+            scored = {"step": int(run.state.step), "held_out": _names_and_sizes(score.held_out)}
+            scores = read_json(score_file) if score_file.is_file() else {}
+            if scores.get("scored") != scored:  # other steps or recordings, or none yet
+                scores = {"scored": scored, **score(variables_of(run.state))}
+                write_json(score_file, scores)
+            recalls[rate] = float(scores[RECALL])
         except FloatingPointError:
             recalls[rate] = None
         report(f"learning rate {rate:g}: {RECALL} {recalls[rate]}")

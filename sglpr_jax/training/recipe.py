@@ -13,8 +13,9 @@ from jaxtyping import Float32, Int
 
 from sglpr_jax.data.packed import packed
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.files import warn
 from sglpr_jax.models.sglpr import init
-from sglpr_jax.models.weights import Params, adopt, graft, own_hash, weights_hash, without_whitening
+from sglpr_jax.models.weights import Params, adopt, different_fields, graft, own_hash, weights_hash, without_whitening
 from sglpr_jax.models.weights_file import LAST_WEIGHTS, load, save
 from sglpr_jax.training.batch_source import TupleBatches, training_batches
 from sglpr_jax.training.callbacks import Callback
@@ -33,6 +34,10 @@ LIMITS = ("config.steps",)
 
 ScoreFn = Callable[[Params], dict[str, float]]
 """Scores weights."""
+
+
+class PackingStopped(Exception):
+    """A run was asked to stop while it packed its recordings. Complete packs are kept."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -92,7 +97,7 @@ def train(
         cache: Folder in which each recording is packed on first use, for faster reading.
         callback: Follows the run: a `ProgressBar`, `EventFiles` or your own.
         stopped: Called after every step. If it returns true, the run saves its state and stops. While recordings are
-            packed, a stop raises KeyboardInterrupt.
+            packed, a stop raises `PackingStopped`.
         settings: Entries of config.json beside `config`. They must be equal in a resumed run. None: the names of the
             recordings, and the weights.
 
@@ -100,7 +105,8 @@ def train(
         The weights and a summary of the run.
 
     Raises:
-        ValueError: The recordings do not fit `config`, or the run to resume has other settings or more steps done.
+        ValueError: The recordings or the weights do not fit `config`, or the run to resume has other settings or more
+            steps done.
         FileExistsError: The folder already has a run.
         FileNotFoundError: The folder has no run to resume.
         FloatingPointError: The loss is not finite.
@@ -114,8 +120,8 @@ def train(
     folder = Path(out)
     config = with_teacher(without_untrained_head(config))
     _require_usable(config, recordings, also, test)
-    if config.loss.segmentation_alone and weights is None:
-        raise ValueError("loss.segmentation_alone trains no descriptors: expected weights to begin with, found none")
+    if config.loss.segmentation_alone:
+        config = with_kept_descriptors(config, weights)
     if settings is None:
         settings = {
             "recordings": [recording.name for recording in recordings],
@@ -137,6 +143,11 @@ def train(
             raise ValueError(f"{folder}: expected {expected}, found {config.steps}")
         lock = lock_run(folder, run_settings(config, settings), seed=config.seed, resume=resume, limits=LIMITS)
         on_all_hosts(lambda: is_first_host() and exit_stack.enter_context(lock))
+        if config.model.segments and not _have_labels((*recordings, *also)):
+            warn(
+                f"expected labels for the segmentation head, found none in {len(recordings) + len(also)} recording(s): "
+                "the head stays untrained; --model.categories 0 omits it"
+            )
         options = {"start_from": start_from, "resume": resume, "callback": host_callback, "stopped": stopped}
         state = run_network(config, source, folder, score=score, **options).state
         steps, params, speed = int(state.step), host_copy(state.params), None
@@ -208,14 +219,10 @@ def _require_usable(
     hosts = jax.process_count()
     if hosts > 1 and (also or config.sampling.mining != "none"):
         raise ValueError(f"mined negatives and a second dataset work on one host only, found {hosts} hosts")
-    if bool(also) != bool(config.also_tuples):
-        raise ValueError(
-            "also_tuples is the number of tuples per step from the second dataset: expected both or neither, "
-            f"found {len(also)} of its recordings and {config.also_tuples} tuples"
-        )
+    _require_usable_also(config, recordings, also)
     if test is not None and test.name in {recording.name for recording in recordings}:
         raise ValueError(f"expected recordings to train on other than the one tested, found {test.name} in both")
-    if config.loss.segmentation_alone and not any(any(recording.labelled) for recording in (*recordings, *also)):
+    if config.loss.segmentation_alone and not _have_labels((*recordings, *also)):
         raise ValueError(
             "loss.segmentation_alone trains on labels alone: expected labels beside some scans, "
             f"found none in {len(recordings) + len(also)} recording(s)"
@@ -229,6 +236,31 @@ def _require_usable(
                 f"model.head.input reads labels: expected labels beside every scan of sequence {recording.name}, "
                 f"found {labelled} of {len(recording)}"
             )
+
+
+def _require_usable_also(config: TrainConfig, recordings: Sequence[Recording], also: Sequence[Recording]) -> None:
+    """Raise ValueError if the recordings of a second dataset are not used, or if their negatives could be positives."""
+    if bool(also) != bool(config.also_tuples):
+        raise ValueError(
+            "also_tuples is the number of tuples per step from the second dataset: expected both or neither, "
+            f"found {len(also)} of its recordings and {config.also_tuples} tuples"
+        )
+    is_segmented = config.model.segments and _have_labels(also)
+    if also and not (is_segmented or config.also_triplets or config.loss.teacher):
+        raise ValueError(
+            "the second dataset has no effect: expected labels in --also and a segmentation head, or --also-triplets "
+            "True, found neither"
+        )
+    names = {recording.world: recording.name for recording in recordings if recording.world}
+    shared = next((recording for recording in also if recording.world in names), None)
+    if shared is not None and config.also_triplets and config.share_negatives:
+        found = f"{names[shared.world]} in --data and {shared.name} in --also"
+        raise ValueError(f"expected recordings of one world in --data, found world {shared.world} of {found}")
+
+
+def _have_labels(recordings: Sequence[Recording]) -> bool:
+    """Return whether any scan or image of the recordings has labels."""
+    return any(recording.has_labels for recording in recordings)
 
 
 def _identity(weights: Params | Path | str | None) -> str | None:
@@ -261,6 +293,24 @@ def with_teacher(config: TrainConfig) -> TrainConfig:
     return dataclasses.replace(config, model=dataclasses.replace(model, descriptors_of=weights_hash(teacher)))
 
 
+def with_kept_descriptors(config: TrainConfig, weights: Params | Path | str | None) -> TrainConfig:
+    """Return the configuration of a model that keeps the descriptors of its initial weights (`segmentation_alone`).
+
+    Raises ValueError without weights, or if the model would compute other descriptors with them.
+    """
+    expected = "loss.segmentation_alone trains no descriptors: expected"
+    if weights is None:
+        raise ValueError(f"{expected} weights to begin with, found none")
+    given = (weights if isinstance(weights, Params) else load(weights)).config
+    model = dataclasses.replace(config.model, descriptors_of=given.descriptors_of)
+    same_head = dataclasses.replace(given, categories=model.categories, detail=model.detail)
+    if different := different_fields(same_head, model):
+        fields = ", ".join(f"model.{name} {value}" for name, (value, _) in different.items())
+        found = ", ".join(str(value) for _, value in different.values())
+        raise ValueError(f"{expected} {fields}, as in the weights, found {found}")
+    return dataclasses.replace(config, model=model)
+
+
 def _packed(
     recordings: Sequence[Recording], cache: Path | None, callback: Callback, stopped: Callable[[], bool]
 ) -> Sequence[Recording]:
@@ -271,7 +321,7 @@ def _packed(
     def report(recording: Recording, done: int) -> None:
         callback.on_pack(recording.name, done, len(recording))
         if stopped():
-            raise KeyboardInterrupt
+            raise PackingStopped(f"stopped while packing {recording.name}")
 
     return [packed(recording, cache, on_progress=functools.partial(report, recording)) for recording in recordings]
 
@@ -285,10 +335,5 @@ def _initial_weights(weights: Params | Path | str | None, config: TrainConfig) -
     if weights is None:
         return adopt(load(config.loss.teacher), random) if config.loss.teacher else random
     params = weights if isinstance(weights, Params) else load(weights)
-    if config.loss.segmentation_alone and params.config.head.whiten and not config.model.head.whiten:
-        raise ValueError(
-            "loss.segmentation_alone trains no descriptors, found weights with a whitening layer: "
-            "expected model.head.whiten True"
-        )
     params = params if config.model.head.whiten else without_whitening(params)
     return graft(params, random)

@@ -23,7 +23,7 @@ TINY = f"{ROOT}/tests/tiny.py"
 SMALL, LIGHT = "--scans 12 --azimuth-steps 90", "--weights sglpr-small"
 RUN = (
     "methods baselines --data town --methods solid --frames 100",
-    f"loops --world walls town --route same --sensor vlp16 --method sglpr scan-context {SMALL} {LIGHT} --out d",
+    f"loops --world walls --route same --sensor vlp16 --method sglpr scan-context {SMALL} {LIGHT} --out d",
     "loops evidence d --sensor vlp16 --weights sglpr-small",
     "sensors rotation --data images --weights sglpr-small --scans 2 --step-deg 120 --among 20",
     "realism compare --real town --simulated images --scans 2 --out compared",

@@ -111,6 +111,11 @@ def test_a_wrong_setting_or_a_missing_file_is_one_line(tmp_path):
     for arguments, words in (
         (("--candidates.candidats", "7"), "found '--candidates.candidats'; did you mean '--candidates.candidates'?"),
         (("--candidates.candidates=x",), "--candidates.candidates: expected a value of type int, found 'x'"),
+        (("--verification.coarse", "0"), "--verification.coarse: expected a number from 1 up to 1048576, found 0"),
+        (("--verification.reach-m", "-5"), "--verification.reach-m: expected a number above 0, found -5"),
+        (("--verification.wide-blur-m", "0.3"), "verification: expected wide_blur_m above blur_m (0.4), found 0.3"),
+        (("--drift-percent", "-1"), "--drift-percent: expected a number from 0, found -1.0"),
+        (("--max-places", "0"), "--max-places: expected a number from 1"),
         (("--config", tmp_path / "mine.json"), "mine.json: expected a JSON file, found none"),
     ):
         assert_one_line_error(run_command("loops", "scans", "--out", "found", *arguments), words)

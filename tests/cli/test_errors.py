@@ -30,7 +30,7 @@ ERRORS = {
     "live ros:1 --out {out}": "ros:1: expected one of the sources folder, bag, dds, zenoh, found ros",
     "live folder:{root} --out {out} --poses {out}/trajectory.tum": "odometry that this run does not overwrite",
     f"{LOOPS} --optimize": "--odometry, found none",
-    f"{LOOPS} --odometry {{walk}}/poses.tum --min-probability nan": "min_probability: expected a finite number",
+    f"{LOOPS} --odometry {{walk}}/poses.tum --min-probability nan": "--min-probability: expected a finite number",
     f"{LOOPS} --odometry {{root}}/none.tum": "none.tum: expected odometry",
     "loops {town} --seq 08 --out {file}": "expected a folder to write into, found a file",
     f"{MAP} {{out}}.npz": "expected --out to end in .safetensors",
@@ -38,6 +38,8 @@ ERRORS = {
     "peers train rinet {images} --out {out}": "rinet needs points, found only images in sequence 00",
     "peers train": "expected bin/peers train METHOD DATA... --out RUN",
     "relocalize scan.bin --map no.safetensors --submap-m 10": "scan.bin: expected --frame with --submap-m",
+    "relocalize scan.bin --map no.safetensors --gravity scan": "scan.bin: expected --frame with --gravity",
+    "relocalize scan.bin --map no.safetensors --imu-topic /imu": "scan.bin: expected --frame with --imu-topic",
     "reproduce --data {town} --out {out}": "expected tables or figures",
     "reproduce table5 --data {images} --out {out}": "table5 is about semantics",
     "reproduce table1 --data {images} --seq 06 --out {out} --method m2dp polar-fft": "use --method polar-fft",
@@ -52,6 +54,7 @@ ERRORS = {
     f"{TRAIN} --pseudo-labels {{root}}": "NN/<id>.png",
     f"{TRAIN} --sampling.positive-m 0.001": "as positives, found none",
     f"{TRAIN} --hosts 2": "HOST:PORT",
+    f"{TRAIN} --method ssc": "ssc needs points, found only images in sequence 06",
 }
 
 

@@ -92,6 +92,18 @@ def test_a_top_k_list_and_scored_pairs(score, command, laps, tmp_path):
     assert listed["score"] == pytest.approx(400 / 401)
 
 
+def test_results_are_written_into_no_folder_of_scans(command, laps, tmp_path):
+    run = ("evaluate", shutil.copy(laps / "08.npz", tmp_path), "--protocol", "bevplace-recall-at-1")
+    (tmp_path / "08").mkdir()
+    (tmp_path / "08" / "results.json").touch()
+    assert command(*run).status == 0
+    assert [path.name for path in (tmp_path / "08").iterdir()] == ["results.json"]
+    shutil.rmtree(tmp_path / "08")
+    (tmp_path / "08-results").rename(tmp_path / "08")  # a folder of results is written again
+    assert command(*run).status == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"08.npz", "08"}
+
+
 def test_methods_are_compared_on_one_page(score, laps):
     compare = ("--poses", laps / "tum.txt", "--compare", laps / "blind.npy", laps / "topk.txt", "--distance", "l2")
     ended, folder = score("mine.npy", *compare, "--protocol", "top1-f1max", "bevplace-recall-at-1")

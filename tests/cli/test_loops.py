@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
-from sglpr_jax.extras import install_command
 from sglpr_jax.loops import search
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure
 from sglpr_jax.loops.config import DetectorConfig
@@ -120,25 +119,19 @@ def test_rejected_pairs_and_missing_loops_are_explained(command, town, tmp_path,
     assert [row["reason"] for row in rows] == ["repeats", "degenerate"]
 
 
-def test_input_that_the_run_would_overwrite_is_refused(command, town, odometry, tmp_path):
-    path = tmp_path / "found" / "trajectory-optimized.tum"
+@pytest.mark.parametrize("name", ["trajectory-optimized.tum", "loops.g2o"])
+def test_input_that_the_run_would_overwrite_is_refused(command, town, odometry, tmp_path, name):
+    path = tmp_path / "found" / name
     write_tum(path, odometry, np.arange(float(SCANS)))
     ended = command("loops", town, "--seq", "08", "--out", tmp_path / "found", "--odometry", path)
-    assert_one_line_error(ended, "trajectory-optimized.tum: expected inputs that this run does not overwrite")
+    assert_one_line_error(ended, f"{name}: expected inputs that this run does not overwrite")
     assert path.exists()
 
 
 @pytest.mark.parametrize(
-    ("layout", "installed", "flags", "registered", "said"),
-    [
-        ("town", True, [], True, None),
-        ("town", False, [], False, f"because small-gicp is not installed: {install_command('slam')}"),
-        ("images", True, [], False, "because they are ready-made images"),
-    ],
+    ("layout", "registered", "said"), [("town", True, None), ("images", False, "because they are ready-made images")]
 )
-def test_scans_are_registered_if_possible(
-    command, town, images, tmp_path, monkeypatch, layout, installed, flags, registered, said
-):
+def test_scans_are_registered_if_possible(command, town, images, tmp_path, monkeypatch, layout, registered, said):
     asked = []
 
     def searched(recordings, params, *, registered, **options):
@@ -146,9 +139,8 @@ def test_scans_are_registered_if_possible(
         return search.LoopSearchResult((search.Session(recordings[0], len(recordings[0])),))
 
     monkeypatch.setattr(search, "find_loops", searched)
-    monkeypatch.setattr(search, "is_installed", lambda: installed)
     source = (town, "--seq", "08") if layout == "town" else (images, "--seq", "06")
-    ended = command("loops", *source, "--out", tmp_path / "found", *flags)
+    ended = command("loops", *source, "--out", tmp_path / "found")
     assert ended.status == 0 and asked == [registered], ended.error
     lines = [line for line in ended.error.splitlines() if "not registered" in line]
     assert len(lines) == (said is not None) and all(line.endswith(said) for line in lines)

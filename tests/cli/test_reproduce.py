@@ -1,14 +1,15 @@
 """bin/reproduce: leave-one-out runs on the small town, and the tables and figures made of them."""
 
+import dataclasses
 import json
 import shutil
 
 import pytest
 
-from sglpr_jax.methods.learned.disco import DISCO
+from sglpr_jax.methods.learned.rinet import RINET
 from sglpr_jax.methods.learned.trained import random_variables, save_variables
 from sglpr_jax.reproduce.experiments import VARIANTS, variant_config
-from sglpr_jax.reproduce.plan import make_plan
+from sglpr_jax.reproduce.plan import check_inputs, make_plan
 from sglpr_jax.reproduce.reproduction import Reproduction
 from sglpr_jax.reproduce.tables import OURS, PUBLISHED, PaperTable, Row
 from sglpr_jax.sim.dataset import simulate
@@ -126,8 +127,8 @@ def test_a_plan_writes_no_simulated_recordings(command, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_weights_are_compared_without_training_by_both_protocols(town, trained, tmp_path, command):
-    out, peer = tmp_path / "out", tmp_path / "disco"
-    save_variables(peer, DISCO, random_variables(DISCO, seed=0), {})
+    out, peer = tmp_path / "out", tmp_path / "rinet"
+    save_variables(peer, RINET, random_variables(RINET, seed=0), {})
     options = ("--data", town, "--seq", "08", "--out", out, "--method", "polar-fft", "--no-train")
     ended = command("reproduce", "table1", "table2", *options, "--weights", trained.folder, peer)
     assert ended.status == 0, ended.error
@@ -146,3 +147,17 @@ def test_weights_are_compared_without_training_by_both_protocols(town, trained, 
             expected = None if file else pytest.approx(means[0] - means[1])
             assert turned[name]["change"] == expected
     assert "poses: " in ended.out and not list(out.glob("full"))
+
+
+def test_table_6_needs_labels_of_every_scan(town, preset, tmp_path, monkeypatch):
+    recording_of = Reproduction.recording
+
+    def without_first_label(reproduction, seq):
+        recording = recording_of(reproduction, seq)
+        return dataclasses.replace(recording, label_paths=(None, *recording.label_paths[1:]))
+
+    monkeypatch.setattr(Reproduction, "recording", without_first_label)
+    reproduction = Reproduction(tmp_path, town, str(preset), load_preset(str(preset)), ("08",))
+    check_inputs(reproduction, ["table5"])
+    with pytest.raises(ValueError, match=r"table6 .* labels of every scan, found none for 1 scans of sequence 00"):
+        check_inputs(reproduction, ["table6"])

@@ -68,7 +68,7 @@ def test_a_scan_is_located_only_in_a_map_of_the_same_scale(command, drive, tmp_p
     values = json.loads((found / "command.json").read_text())
     assert (values["scale"], values["submap-m"]) == (2, 6)
     assert ", scale 2" in ended.out and PlaceMap.load(out).scale == 2
-    wrong = "town.safetensors: expected descriptors with scale {}, found 2: they are not comparable"
+    wrong = "town.safetensors: expected descriptors with scale 2, found {}: they are not comparable"
     assert_one_line_error(command(*query, "--scale", "4"), wrong.format(4))
     more = ("map", folder, "--poses", poses, "--add-to", out, "--out", out, "--weights", "sglpr-small")
     assert_one_line_error(command(*more), wrong.format(1))

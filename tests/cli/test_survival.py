@@ -10,6 +10,7 @@ import pytest
 
 from sglpr_jax.cli.config_file import COMMAND_FILE
 from sglpr_jax.loops import candidates
+from sglpr_jax.training.callbacks import ProgressBar
 from sglpr_jax.training.metrics_log import read_metrics
 
 from .conftest import run_command
@@ -86,3 +87,11 @@ def test_a_training(images, preset, tmp_path):
     assert contents(out / "weights") == contents(whole / "weights")
     for folder in (".", "checkpoints", "weights", "test"):
         assert sorted(os.listdir(out / folder)) == sorted(os.listdir(whole / folder))
+
+
+def test_the_packing_before_a_training(images, preset, tmp_path, monkeypatch):
+    monkeypatch.setattr(ProgressBar, "on_pack", lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+    options = ("--data", images, "--preset", preset, "--out", tmp_path / "out", "--cache", tmp_path / "cache")
+    ended = run_command("train", "--seq", "06", *options)
+    assert ended.status == 0 and "stopped while packing 00; run the same command again" in ended.error, ended.error
+    assert not list(tmp_path.glob("*/*"))

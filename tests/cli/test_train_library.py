@@ -7,16 +7,18 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.readers import open_recording
+from sglpr_jax.files import DataWarning
 from sglpr_jax.models.weights import for_places, weights_hash, with_whitening
 from sglpr_jax.models.weights_file import load, save
 from sglpr_jax.training.callbacks import Callback
 from sglpr_jax.training.metrics_log import read_metrics
 from sglpr_jax.training.presets import load_preset
-from sglpr_jax.training.recipe import train
+from sglpr_jax.training.recipe import train, with_kept_descriptors
 from sglpr_jax.training.trainer import METRICS_FILE
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:expected labels for the segmentation head")
 def test_a_training_is_one_call(images, preset, tmp_path):
     config = dataclasses.replace(load_preset(str(preset)), steps=3)
     recordings, told = [open_recording(images, "00")], []
@@ -33,7 +35,8 @@ def test_a_training_is_one_call(images, preset, tmp_path):
 
     out = tmp_path / "run"
     stops = iter([False, True])
-    stopped = train(config, recordings, out=out, callback=Noting(), stopped=lambda: next(stops))
+    with pytest.warns(DataWarning, match="found none in 1 recording.*the head stays untrained"):
+        stopped = train(config, recordings, out=out, callback=Noting(), stopped=lambda: next(stops))
     assert (stopped.steps, stopped.finished) == (2, False) and told == [2, "end 2", "closed"]
     with pytest.raises(FileExistsError, match="there is a run already"):
         train(config, recordings, out=out)
@@ -85,6 +88,18 @@ def test_recordings_that_cannot_be_trained_on_are_refused_before_the_run(
     given = with_whitening(
         random_params(config.model), np.random.default_rng(0).normal(size=(600, 256)).astype(np.float32)
     )
-    with pytest.raises(ValueError, match=r"found weights with a whitening layer: expected model\.head\.whiten True"):
+    with pytest.raises(ValueError, match=r"expected model\.head\.whiten True, as in the weights, found False"):
         train(alone, [labelled], out=tmp_path / "run", weights=given)
+    given = random_params(dataclasses.replace(config.model, blind_m=2.0, categories=0))
+    with pytest.raises(ValueError, match=r"expected model\.blind_m 2\.0, as in the weights, found 0\.0"):
+        train(alone, [labelled], out=tmp_path / "run", weights=given)
+    given = random_params(dataclasses.replace(config.model, descriptors_of="a teacher"))
+    assert with_kept_descriptors(alone, given).model == given.config
+    mixed = dataclasses.replace(config, also_tuples=1)
+    with pytest.raises(ValueError, match="no effect: expected labels in --also and a segmentation head, or --also-"):
+        train(mixed, [labelled], out=tmp_path / "run", also=[recording])
+    mixed = dataclasses.replace(mixed, also_triplets=True, share_negatives=True)
+    first, second = (dataclasses.replace(labelled, name=name, world="town") for name in ("first", "second"))
+    with pytest.raises(ValueError, match="found world town of first in --data and second in --also"):
+        train(mixed, [first], out=tmp_path / "run", also=[second])
     assert not list(tmp_path.iterdir())

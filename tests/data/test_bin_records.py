@@ -41,6 +41,7 @@ def columns(points: np.ndarray, more: str) -> np.ndarray:
     return np.column_stack([points, *(made[name] for name in more)])
 
 
+SHUFFLED = np.random.default_rng(0).permutation(scan(0))
 LAYOUTS = {
     "float32x3": "",
     "kitti": "i",
@@ -89,8 +90,9 @@ def test_a_broken_file_among_others_does_not_hide_it(tmp_path):
         (scan(0) * 1000, "of the points not finite or beyond 300 m"),
         (np.zeros((2880, 3)), "all points NaN or 0"),
         (np.full((2880, 3), 4.0), "all points with the same x or y"),
+        (columns(SHUFFLED, "i").T.reshape(-1, 4)[:, :3], "kitti (16 bytes a point): x, y and z distributed alike"),
     ],
-    ids=["millimetres", "zeros", "one point"],
+    ids=["millimetres", "zeros", "one point", "column after column"],
 )
 def test_what_fits_nothing_is_refused_with_what_was_tried(tmp_path, points, why):
     for i in range(3):
@@ -103,12 +105,13 @@ def test_what_fits_nothing_is_refused_with_what_was_tried(tmp_path, points, why)
 
 
 def test_what_fits_twice_is_refused_and_may_be_said(tmp_path):
-    noise = np.random.default_rng(0).normal(scale=10, size=(4000, 4)).astype("<f4")  # all columns alike
+    noise = np.random.default_rng(0).normal(size=(4002, 4)) * [10, 30, 10, 30]  # columns 0 and 2, 1 and 3 alike
+    noise = noise.astype("<f4")
     noise.tofile(tmp_path / "0.bin")
-    with pytest.raises(ValueError, match=r"found 2; pass --format kitti or float32x5, .*float32x8[^;]*: fits"):
+    with pytest.raises(ValueError, match=r"found 2; pass --format kitti or float32x6, .*float32x8[^;]*: fits"):
         open_recording(tmp_path)
     np.testing.assert_array_equal(open_recording(tmp_path, format="float32x4").points(0), noise[:, :3])
-    assert open_recording(tmp_path, format="float32x5").points(0).shape == (3200, 3)
+    assert open_recording(tmp_path, format="float32x6").points(0).shape == (2668, 3)
 
 
 def test_a_wrong_format_that_was_said_is_told(tmp_path):
@@ -131,6 +134,14 @@ def test_own_scans_in_the_layout_of_kitti(kitti_root):
         assert recording.found[0] == f"format: {said}"
         np.testing.assert_array_equal(recording.points(1), scan(1).astype(np.float32))
     assert open_recording(kitti_root, format="float64x3").found[0] == "format: float64x3, as given"
+
+
+def test_a_small_square_room_is_a_scan(tmp_path):
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(208, 3)) * [1, 1, 0.5]
+    room = directions * (np.array([1.5, 1.5, 1.3]) / np.abs(directions)).min(axis=1, keepdims=True)
+    columns(room, "i").astype("<f4").tofile(tmp_path / "0.bin")
+    assert read_scan(tmp_path / "0.bin").shape == (208, 3)
 
 
 def test_one_scan_with_few_points_is_kittis(tmp_path):

@@ -11,8 +11,9 @@ from recordings import of_scans
 from scipy.linalg import expm, logm
 
 import sglpr_jax
-from sglpr_jax.data.deskew import deskew, deskewed, poses_at
+from sglpr_jax.data.deskew import deskew, deskewed, has_point_times, point_times_problem, poses_at
 from sglpr_jax.data.scan import Scan, TimeField
+from sglpr_jax.files import DataWarning
 
 RATE_S = 0.1
 WORLD = np.random.default_rng(0).uniform([-40, -40, -2], [40, 40, 6], (24, 3))
@@ -92,6 +93,35 @@ def test_a_recording_is_deskewed_and_a_scan_without_a_neighbour_stays():
     assert found.read_options["deskewed"] != deskewed(recording_of(times, clouds), 1.0 * poses[::-1]).read_options
     with pytest.raises(ValueError, match="expected times of the points to remove the motion within scans, found none"):
         deskewed(found, poses)
+
+
+def test_a_first_scan_with_other_times_of_points_is_the_only_one_that_is_not_deskewed():
+    times, poses, clouds = drive(twist([0, 0, 3], [2, 0, 0]))
+    recording = recording_of(times, clouds)
+
+    def read(path, labels):
+        scan = recording.read(path, labels)
+        return dataclasses.replace(scan, time_field=TimeField("time", 0 * WITHIN)) if path.stem == "000" else scan
+
+    odd = dataclasses.replace(recording, read=read)
+    assert has_point_times(odd)
+    found = deskewed(odd, poses)
+    with pytest.warns(DataWarning, match="scan 000 of sequence 08: expected times .* motion within this scan is not"):
+        np.testing.assert_array_equal(found.points(0), clouds[0])
+    np.testing.assert_allclose(found.points(1), measured(poses[1], WORLD), atol=2e-3)
+
+
+def test_why_scans_cannot_be_deskewed_is_said():
+    times, _, clouds = drive(twist([0, 0, 1], [5, 0, 0]))
+    recording = recording_of(times, clouds)
+    times = times[[0, 1, 1, 3]]
+    assert point_times_problem(recording) == ""
+    for problem, other in (
+        ("no later time of scan 002 than of the scan before it", dataclasses.replace(recording, times=times)),
+        ("no times of scans", dataclasses.replace(recording, times=None)),
+        ("no times of points", recording_of(times, clouds, within=0 * WITHIN)),
+    ):
+        assert point_times_problem(other) == problem and not has_point_times(other)
 
 
 def test_invalid_arguments_are_one_clear_error():

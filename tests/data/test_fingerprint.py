@@ -17,7 +17,7 @@ from sglpr_jax.data.readers import open_recording
 def test_another_format_mounting_or_position_is_another_recording(tmp_path):
     rng = np.random.default_rng(0)
     for i in range(3):
-        rng.uniform(-20, 20, (240, 8)).astype("<f4").tofile(tmp_path / f"{i}.bin")
+        (rng.uniform(-20, 20, (480, 4)) * [1, 1, 0.1, 1]).astype("<f4").tofile(tmp_path / f"{i}.bin")
     one, other = (open_recording(tmp_path, format=format, sensor_height=1.73) for format in ("kitti", "float32x8"))
     moved = dataclasses.replace(one, positions=np.zeros((3, 3)))
     found = {fingerprint(one), fingerprint(other), fingerprint(moved)}

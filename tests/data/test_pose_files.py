@@ -38,6 +38,8 @@ def write(tmp_path):
         ("a.csv", "# Timestamp,x,y,z\n.5,1,2,3\n", "auto", [[1, 2, 3]], [0.5], "csv"),
         ("a.csv", "time_s,x,y,z\n.5,1,2,3\n", "auto", [[1, 2, 3]], [0.5], "csv"),
         ("a.csv", "x,y,z\n1,2,3\n", "auto", [[1, 2, 3]], None, "csv"),
+        ("a.csv", "\ufefft,x,y,z\n.5,1,2,3\n", "auto", [[1, 2, 3]], [0.5], "csv"),  # as Excel writes it
+        ("a.txt", "\ufeff.5 1 2 3 0 0 0 1\n", "auto", [[1, 2, 3]], [0.5], "TUM"),
     ],
 )
 def test_every_format(write, name, text, format, positions, times, said):

@@ -100,7 +100,10 @@ def write_poses(path, positions):
     [
         (("full10", "full0", "full2", "full1", "full02"), ("full0", "full1", "full2", "full02", "full10")),
         (("1.5", "1.0", "1.75", "1.25"), ("1.0", "1.25", "1.5", "1.75")),
+        (("scan_7.5", "scan_7.25", "scan_6.9"), ("scan_6.9", "scan_7.25", "scan_7.5")),
+        (("b_1.5", "b_1.25", "a_1.5"), ("a_1.5", "b_1.5", "b_1.25")),
         (("2012.10.2", "2012.9.15"), ("2012.9.15", "2012.10.2")),
+        (("2012.1.10", "2012.1.9"), ("2012.1.9", "2012.1.10")),
         (("000003", "._000003", ".old"), ("000003",)),
     ],
 )
@@ -150,6 +153,29 @@ def test_poses_and_scans_that_do_not_fit_are_refused(tmp_path, bev_root):
     write_scans(folder, "1.pcd")
     with pytest.raises(ValueError, match=r"scans: expected one file for each scan, found 1\.bin and 1\.pcd"):
         open_recording(folder)
+
+
+def test_poses_in_other_axes_than_those_of_the_layout_are_told(kitti_root, bev_root):
+    drive = np.arange(4.0)[:, None] * [100, 60, 0]
+    write_poses(kitti_root / "sequences/08/poses.txt", drive)  # z up instead of camera axes
+    with pytest.warns(DataWarning, match=r"sequence 08: expected z up, found heights over 180 m and 0 x 300 m"):
+        open_recording(kitti_root)
+    write_poses(bev_root / "06/pose.txt", drive[:, [1, 2, 0]])  # camera axes instead of z up
+    with pytest.warns(DataWarning, match=r"sequence 06: expected z up, found heights over 200 m and 120 x 0 m"):
+        open_recording(bev_root)
+
+
+def test_a_format_that_the_layout_defines_is_refused(kitti_root, bev_root):
+    for root in (kitti_root, bev_root):
+        (root / "simulation.json").write_text('{"sensor": {"height_m": 1.73}}')
+        with pytest.raises(ValueError, match=r"expected pose_format 'auto' for the layout .*, found 'lidar'"):
+            open_recording(root, pose_format="lidar")
+    assert open_recording(kitti_root.parent, "kitti/08", format="kitti").found[0].endswith(", as given")
+    for root, name in ((bev_root, "06"), (bev_root.parent, "bev/06")):
+        with pytest.raises(
+            ValueError, match=r"bev: expected format 'auto' for the layout .*BEV images\), found 'kitti'"
+        ):
+            open_recording(root, name, format="kitti")
 
 
 def test_what_is_left_aside_is_said(tmp_path):

@@ -36,7 +36,7 @@ def test_every_driver(driver):
 @given(
     span_s=st.floats(0.02, 0.99),
     unit_s=st.sampled_from([1.0, 1e-3, 1e-6, 1e-9]),
-    begin_s=st.one_of(st.floats(-1.0, 1.0), st.floats(1e3, 2e9)),
+    begin_s=st.one_of(st.floats(-0.99, 0.99), st.floats(1.1, 1e3), st.floats(1e3, 2e9)),
     header_late_s=st.floats(-0.9, 0.9),
     order=st.integers(0, 9),
 )

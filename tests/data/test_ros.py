@@ -12,9 +12,11 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 from scipy.spatial.transform import Rotation
 
+from sglpr_jax.data.formats.ros_messages import Stamps, times_on_one_clock
 from sglpr_jax.data.poses import have_poses, interpolate_poses
 from sglpr_jax.data.readers import open_recording, recording_names, ros
 from sglpr_jax.data.scan_stream import only_readable
+from sglpr_jax.files import DataWarning
 from sglpr_jax.se3 import poses_of
 
 LATE_S = 1000.0
@@ -269,6 +271,55 @@ def test_rotations_that_nobody_measured_are_none(tmp_path, quaternion):
     recording = opened(tmp_path, "ros2", clouds("ros2", times) + track)
     assert recording.world_from_lidar is None and len(recording.positions) == len(times)
     assert recording.pose_source.endswith("interpolated; its rotations are constant or missing)")
+
+
+def stamps(header_s: np.ndarray, delay_s: float) -> Stamps:
+    return Stamps(np.rint((header_s + delay_s) * 1e9).astype(np.int64), header_s)
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "ahead_s", "phase_s", "used"),
+    [
+        (0.2, 37.0, 0.01, "recorder"),  # the LiDAR has the clock of PTP
+        (0.2, -18.0, 0.01, "recorder"),
+        (4.0, 0.0, 0.01, "header"),
+        (8.0, 0.0, 0.0, "header"),  # slow SLAM, with the times of the scans
+        (900.0, 0.0, 0.01, "header"),  # another pass
+    ],
+)
+def test_two_clocks_are_found_by_the_times_of_the_recorder(delay_s, ahead_s, phase_s, used):
+    times = 1.7e9 + np.arange(0.0, 200.0, 0.5)
+    scans = Stamps(stamps(times, 0.1).recorder_ns, times + ahead_s)
+    poses = stamps(times + phase_s, delay_s)
+    if used == "recorder":
+        expected = poses.recorder_s, scans.recorder_s
+        with pytest.warns(DataWarning, match=rf"a\.bag: .* 0\.2 s after .* scans {0.1 - ahead_s:.1f} s after theirs"):
+            found = times_on_one_clock(poses, scans, source="a.bag")
+    else:
+        expected = poses.header_s, scans.header_s
+        found = times_on_one_clock(poses, scans, source="a.bag")
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_poses_of_a_lidar_on_another_clock_are_those_at_its_scans(tmp_path):
+    times = np.arange(5.0, 105.0)
+    ahead = [("/points", CLOUD, LATE_S + t, cloud("mcap", LATE_S + t + 37, points_of(0)[:4])) for t in times]
+    often = np.arange(4.75, 106.0)
+    track = [("/odom", ODOMETRY, LATE_S + t, pose("mcap", LATE_S + t, where(t), turned(t))) for t in often]
+    with pytest.warns(DataWarning, match=r"/odom: .* recorded 0\.0 s after .*, and scans -37\.0 s after theirs"):
+        recording = opened(tmp_path, "mcap", ahead + track)
+    np.testing.assert_allclose(recording.positions, [where(t) for t in times], atol=1e-4)
+
+
+def test_few_messages_may_come_late_but_a_clock_may_not_be_set_back():
+    times = 100 + np.arange(400) / 20
+    scans, one_late = stamps(times, 0.3), times[np.r_[:50, 51:56, 50, 56:400]]
+    assert not Stamps(scans.recorder_ns, one_late).headers_are_valid()
+    found = times_on_one_clock(Stamps(scans.recorder_ns, one_late), scans, source="a.bag")
+    np.testing.assert_array_equal(found, (one_late, times))
+    set_back = np.where(times < 110, times, times - 1)
+    found = times_on_one_clock(Stamps(scans.recorder_ns, set_back), scans, source="a.bag")
+    np.testing.assert_array_equal(found, (scans.recorder_s, scans.recorder_s))
 
 
 def test_bags_of_two_days_are_two_recordings(tmp_path):

@@ -94,6 +94,23 @@ def test_methods_with_poses_without_times_get_the_times_of_a_descriptor_file(tmp
     check_agreement(found["mine"], found["own"])
 
 
+def test_descriptor_files_without_positions_or_times_get_those_of_the_first_file_or_the_dataset(
+    tmp_path, make_file, two_laps, poses
+):
+    bare, own, untimed = (tmp_path / f"{name}.npz" for name in ("bare", "own", "untimed"))
+    dataclasses.replace(make_file(two_laps, two_laps), positions=None).save(bare)
+    make_file(two_laps + 1, two_laps, times=poses.times).save(own)
+    make_file(two_laps + 1, two_laps).save(untimed)
+    (found,) = read_methods([bare], dataset=poses).values()
+    np.testing.assert_array_equal(found.positions, two_laps)
+    assert found.times is poses.times and found.pose_source == "laps.csv (csv)"
+    found = read_methods([own, bare, untimed], dataset=poses)
+    for name in ("bare", "untimed"):
+        check_agreement(found["own"], found[name])
+        np.testing.assert_array_equal(found[name].positions, two_laps + 1)
+        np.testing.assert_array_equal(found[name].times, poses.times)
+
+
 def test_top_k_lists_and_scored_pairs(read):
     found = read("list.txt", "# query: answers\n400: 0=.9 7=-.5\n\n401:\n402: 2=0.25\n")
     assert isinstance(found, TopK)
@@ -144,12 +161,22 @@ def test_default_protocols_fit_the_input(read):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"ids": ("000000", "000001", "000005")}, "3 with '000002', found 3 with '000005'"),
+        ({"ids": ("a", "b", "d")}, "3 with 'c', found 3 with 'd'"),
         ({"times": np.array([0.0, 1.0, 2.5])}, "times of the first file, 2.0 in row 2, found 2.5"),
     ],
 )
 def test_other_frames_positions_or_times_are_refused(make_file, change, message):
     few = make_file(np.arange(9.0).reshape(3, 3), np.eye(3), times=np.arange(3.0))
+    few = dataclasses.replace(few, ids=("a", "b", "c"))
     other = dataclasses.replace(few, **change)
     with pytest.raises(ValueError, match=f"theirs: .*{message}"):
         evaluate_methods({"ours": few, "theirs": other}, ["top1-f1max"])
+
+
+def test_row_numbers_as_ids_fit_any_ids_of_as_many_frames(make_file):
+    rows = make_file(np.arange(9.0).reshape(3, 3), np.eye(3))
+    named = dataclasses.replace(rows, ids=("1328", "1329", "1330"))
+    check_agreement(named, rows)
+    check_agreement(rows, named)
+    with pytest.raises(ValueError, match="the first file, 3 with '1328', found 2 with '000000'"):
+        check_agreement(named, rows.only(np.array([True, True, False])))

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from sglpr_jax.live import folder
-from sglpr_jax.live.folder import GrowingPoses
+from sglpr_jax.live.folder import NEAR_POSES, FolderSource, GrowingPoses
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.sources_and_sinks import open_source
 from sglpr_jax.pose_graph.files import write_tum
 from sglpr_jax.se3 import transform
 
-POINTS = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)
+POINTS = (np.random.default_rng(0).normal(size=(300, 3)) * [3, 3, 1]).astype(np.float32)
 STAMP = 1_700_000_000.0
 
 
@@ -66,8 +66,26 @@ def test_scans_of_a_folder_come_in_order_once_they_are_complete(incoming, said):
 def test_a_folder_is_continued_after_the_last_scan_of_the_map(incoming, said):
     paths = [scan(incoming / f"{i}.bin") for i in range(4)]
     known = {str(paths[1].resolve())}
-    source = open_source(f"folder:{incoming}", LiveOptions(), said, is_in_map=known.__contains__)
+    source = open_source(f"folder:{incoming}", LiveOptions(), said, map_names=known)
     assert [Path(frame.scan.name).name for frame in looked(source, 0.5)] == ["2.bin", "3.bin"]
+
+
+def test_removed_scans_of_the_map_are_an_error_if_their_number_is_the_line_of_their_pose(incoming, tmp_path, said):
+    options, place = LiveOptions(poses=tmp_path / "poses.tum"), incoming.resolve()
+    scan(incoming / "1.bin")
+    open_source(f"folder:{incoming}", options, said, map_names={f"{place}/{STAMP}.bin", f"{place.parent}/0.bin"})
+    with pytest.raises(ValueError, match=r"incoming: expected all scans of the map, .*found 1 removed \(0\.bin\)"):
+        open_source(f"folder:{incoming}", options, said, map_names={f"{place}/0.bin", f"{place}/1.bin"})
+
+
+def test_the_folder_is_not_listed_again_while_scans_wait(incoming, said, monkeypatch):
+    for i in range(5):
+        os.utime(scan(incoming / f"{i}.bin"), (STAMP, STAMP))
+    source, listings, list_folder = open_source(f"folder:{incoming}", LiveOptions(), said), [], FolderSource._list
+    monkeypatch.setattr(FolderSource, "_list", lambda self: listings.append(list_folder(self)) or listings[-1][:])
+    assert len(taken(source, 5)) == 5 and len(listings) == 1
+    scan(incoming / "5.bin")
+    assert len(taken(source, 1)) == 1 and [path.name for path in listings[-1]] == ["5.bin"]
 
 
 def test_a_scan_that_cannot_be_read_is_reported_and_the_others_come(incoming, said):
@@ -104,6 +122,27 @@ def test_a_scan_waits_for_a_pose_at_its_time_and_takes_the_last_one_only_if_it_i
     np.testing.assert_allclose(found.of(0, STAMP + 0.3), transform(3.0, 0.0, 0.0), atol=1e-4)
 
 
+def test_a_scan_whose_file_has_a_date_in_the_future_does_not_wait_longer(incoming, tmp_path, said, monkeypatch):
+    monkeypatch.setattr(folder, "MAX_POSE_WAIT_S", 0.1)
+    ahead = time.time() + 3600
+    os.utime(scan(incoming / "0.bin"), (ahead, ahead))
+    source = open_source(f"folder:{incoming}", LiveOptions(poses=tmp_path / "poses.tum"), said)
+    assert [frame.odometry for frame in taken(source, 1, 5.0)] == [None]
+
+
+def test_old_poses_are_dropped_and_a_file_that_begins_anew_is_read_from_its_beginning(tmp_path):
+    path = tmp_path / "poses.tum"
+    found, poses = GrowingPoses(path, "tum", "auto"), np.stack([transform(float(i), 0.0, 0.0) for i in range(200)])
+    write_tum(path, poses, STAMP + np.arange(200.0))
+    found.read_appended()
+    assert found.of(100, None)[0, 3] == 100 and found.of(101, None)[0, 3] == 101
+    assert found.of(0, STAMP + 198)[0, 3] == pytest.approx(198, abs=1e-3) and len(found._poses) == NEAR_POSES + 2
+    write_tum(path, poses[:3], STAMP + np.arange(3.0))
+    with pytest.raises(ValueError, match=r"poses.tum: expected a file that grows, found one that begins anew"):
+        found.read_appended()
+    assert found.of(2, None)[0, 3] == 2
+
+
 def test_a_file_of_poses_grows_and_a_damaged_line_costs_its_own_scan(tmp_path):
     path = tmp_path / "poses.txt"
     found = GrowingPoses(path, "lidar", "auto")
@@ -122,3 +161,13 @@ def test_a_file_of_poses_grows_and_a_damaged_line_costs_its_own_scan(tmp_path):
     assert found.of(2, None)[0, 3] == 2 and found.of(0, None)[0, 3] == 0
     with pytest.raises(ValueError, match="pass --pose-format kitti or lidar"):
         GrowingPoses(path, "auto", "auto").read_appended()
+
+
+@pytest.mark.parametrize("format", ["tum", "lidar"])
+def test_a_line_of_zeros_is_no_pose(tmp_path, format):
+    path = tmp_path / "poses.txt"
+    path.write_text("# comment\n" + "0 " * (8 if format == "tum" else 12) + "\n")
+    found = GrowingPoses(path, format, "auto")
+    with pytest.raises(ValueError, match=r"poses\.txt, line 2: expected a rotation .*, found 0 0 0 0"):
+        found.read_appended()
+    assert found.of(0, None) is None

@@ -134,6 +134,7 @@ def test_loops_to_scans_before_a_restart_are_found_if_the_odometry_begins_again(
     for edge in across:
         assert np.linalg.norm(drive.positions[edge.query] - drive.positions[edge.match]) < 12
         assert edge.world_from_match is None and np.array_equal(edge.world_from_query, again[edge.query - HALF])
+        assert edge.odometry_frame == whole[1][0].odometry_frame + 1
     corrected = live.trajectory.poses
     apart = np.linalg.norm(corrected[:, :3, 3] - poses[:, :3, 3], axis=1)
     assert apart[:HALF].max() < 1 and apart[HALF:].max() < 5
@@ -178,7 +179,25 @@ def test_a_full_disk_is_reported_and_the_map_lives_on(drive, params, tmp_path, s
         for i in range(2):
             assert live.add(live_frame(drive, i)) == []
     assert len(live) == 2 and said.kinds == ["disk"] and "No space left" in said[0][1]
+    assert said[0][1].endswith("a restart continues before this scan")
+    monkeypatch.setattr("sglpr_jax.live.live_map.sys.getsizeof", pytest.fail)  # names are counted when they come
+    assert live.nbytes > 0
     live.close()
+
+
+def test_a_map_whose_disk_is_full_starts_again(drive, params, tmp_path, said, monkeypatch):
+    live = opened(params, tmp_path, said)
+    live.restore()
+    fail = OSError(28, "No space left on device")
+    monkeypatch.setattr("sglpr_jax.live.live_map.append_whole", lambda *_, **__: (_ for _ in ()).throw(fail))
+    live.add(live_frame(drive, 0))
+    assert said.kinds == ["disk"] and said[0][1].endswith("a restart continues after this scan")
+    live.close()
+    before = (tmp_path / LOOPS_FILE).stat()
+    again = opened(params, tmp_path, said)
+    assert again.restore() == [] and len(again) == 1
+    assert (tmp_path / LOOPS_FILE).stat().st_ino == before.st_ino  # not written
+    again.close()
 
 
 def test_a_removed_folder_is_reported_and_the_results_are_written(drive, params, tmp_path, said):

@@ -1,6 +1,7 @@
 """The node lives on, whatever a scan, a sink or the odometry does, and hands on what the map finds."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -113,7 +114,7 @@ def test_a_closed_terminal_does_not_end_the_node():
     Reports(write)("a", "a0")
 
 
-def test_results_are_lines_of_json(tmp_path, said):
+def test_results_are_lines_of_json(tmp_path, said, monkeypatch):
     sink = open_sink(f"json:{tmp_path}/lines", LiveOptions(), said)
     sink.frame(FrameStatus(3, 1e9 + 0.123456789, 0.0123456789, 0.02, 1, 4, 100))
     sink.loop(EDGE)
@@ -122,8 +123,22 @@ def test_results_are_lines_of_json(tmp_path, said):
     assert (
         loop["type"] == "loop" and loop["match_from_query"] == np.eye(4).tolist() and loop["world_from_match"] is None
     )
+    content, write, free_bytes = (tmp_path / "lines").read_bytes(), os.write, [9]
+
+    def write_to_full_disk(file: int, line: bytes) -> int:
+        if not free_bytes:
+            raise OSError(28, "No space left on device")
+        return write(file, line[: free_bytes.pop()])
+
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
+        patch.setattr(os, "write", write_to_full_disk)
+        sink.loop(EDGE)
     sink.close()
+    assert (tmp_path / "lines").read_bytes() == content
+    (tmp_path / "lines").write_bytes(content + b'{"ty')  # of a program that was killed
     again = open_sink(f"json:{tmp_path}/lines", LiveOptions(), said)
-    again.loop(EDGE)
+    for _ in range(2):
+        again.loop(EDGE)
     again.close()
-    assert len((tmp_path / "lines").read_text().splitlines()) == 3
+    *_, unfinished, third, fourth = (tmp_path / "lines").read_text().splitlines()
+    assert unfinished == '{"ty' and json.loads(third) == json.loads(fourth) == loop

@@ -1,12 +1,10 @@
 """The rerun sink writes a file with the status and the loops, and outlives its viewer."""
 
 import socket
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from recordings import entities
 
 from sglpr_jax.live.data_types import FrameStatus, LoopEdge
 from sglpr_jax.live.options import LiveOptions
@@ -18,13 +16,6 @@ STATUS = FrameStatus(7, 1_700_000_000.25, 0.012, 0.02, 3, 8, 40_000)
 PLACED = LoopEdge(7, 2, 70.0, 20.0, np.eye(4), np.eye(6), 0.97, transform(3.0, 4.0, 0.0), np.eye(4), 0.01)
 UNPLACED = PLACED._replace(query=9, world_from_match=None)
 STATUS_PLOTS = {"/milliseconds/scan", "/milliseconds/latency", "/scans/dropped", "/scans/places"}
-
-
-def entities(path: Path) -> set[str]:
-    """Entities of a file, as the program of rerun lists them."""
-    command = [sys.executable, "-m", "rerun", "rrd", "print", str(path)]
-    run = subprocess.run(command, capture_output=True, text=True, check=True)
-    return {word for line in run.stdout.splitlines() for word in line.replace("`", " ").split() if word.startswith("/")}
 
 
 def test_a_file_has_the_status_and_the_loops(tmp_path, said):

@@ -8,7 +8,7 @@ import pytest
 
 from sglpr_jax.live.data_types import FrameStatus, LoopEdge
 from sglpr_jax.live.options import LiveOptions
-from sglpr_jax.live.ros_encoding import CLOUD, MARKERS, TRANSFORMS
+from sglpr_jax.live.ros_encoding import CLOUD, DELETE, MARKERS, TRANSFORMS
 from sglpr_jax.live.ros_topics import TAKEOVER_S, RosSink, RosSource, domain_of
 from tests.live.messages import LIVOX, ODOMETRY, POINTS, cloud, decoded, odometry, received
 
@@ -151,6 +151,15 @@ def test_an_edge_is_published_and_drawn(transport):
     assert {topic for topic, *_ in transport.sent} == {"/sglpr/loops", "/sglpr/loop_markers"}
     ends = sent(transport, MARKERS)[-1].markers[0].points
     assert [(one.x, one.y) for one in ends] == [(0, 0), (9, 1)]
+
+
+def test_lines_of_an_earlier_odometry_frame_are_deleted(transport):
+    sink = RosSink(transport, LiveOptions())
+    sink.loop(edge(80, 2, moved(9), moved(0), moved(0.5)))
+    sink.loop(edge(90, 3, moved(1), None, moved(0.5))._replace(odometry_frame=1))
+    sink.loop(edge(99, 91, moved(2), moved(1), moved(0.5))._replace(odometry_frame=1))
+    drawn = [message.markers[0] for message in sent(transport, MARKERS)]
+    assert [(one.action, len(one.points)) for one in drawn] == [(0, 2), (DELETE, 0), (0, 2)]
 
 
 def test_the_correction_of_the_odometry_is_published(transport):

@@ -1,5 +1,7 @@
 """The candidate search compares each scan with the right earlier scans, estimates the motion, and stores scans."""
 
+import functools
+
 import numpy as np
 import pytest
 from scenes import place, seen_from
@@ -30,6 +32,7 @@ def seen_by(finder: CandidateSearch, image: np.ndarray) -> Keyframe:
     return Keyframe(np.zeros(finder.index.width, np.float32), image, None)
 
 
+@functools.cache
 def posts_from(x: float) -> np.ndarray:
     """Image of posts from a position on the x axis."""
     posts = np.random.default_rng(0).uniform(-60, 60, (200, 2))

@@ -12,12 +12,14 @@ from recordings import with_points
 
 import sglpr_jax
 from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.scan_stream import only
 from sglpr_jax.files import DataWarning
 from sglpr_jax.loops import acceptance, checkpoint, search
 from sglpr_jax.loops.comparison import NO_FITS, Fits
 from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
 from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.loops.probability import AdditiveModel, Curve, LoopModel
+from sglpr_jax.odometry.drift_check import OdometryCheck
 from sglpr_jax.pose_graph.folder import write_loop_folder
 from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.registration.bev_search import CorrelationPeak
@@ -101,6 +103,23 @@ def test_a_run_that_forgets_scans_goes_on_too_and_other_limits_are_other_setting
 
 
 @pytest.mark.slow
+def test_a_search_without_the_odometry_goes_on_too_and_begins_after_the_last_scan(twice, params, tmp_path, monkeypatch):
+    monkeypatch.setattr(OdometryCheck, "errors", (0.5, 0.02))
+    recording, scans, done = only(twice[0], range(5)), 5, []
+    options = {"odometry": twice[1][:scans], "registered": False, "config": CONFIG, "kept_in": tmp_path / "kept"}
+    (session,) = find_loops(recording, params, **options, should_stop=stopping_after(2, [])).sessions
+    assert session.frames == 2 and session.odometry is not None
+    for stop in (stopping_after(scans - 2 + 2, []), lambda: False):
+        done.clear()
+        with pytest.warns(DataWarning, match="contradicts the motion .* and is ignored"):
+            found = find_loops(recording, params, **options, should_stop=stop, on_progress=done.append)
+        assert found.sessions[0].odometry is None
+    assert done[0] == scans and done[1] == 2 and found.whole
+    checkpoint.delete_checkpoint(tmp_path / "kept")
+    assert not (tmp_path / "kept").exists()
+
+
+@pytest.mark.slow
 def test_a_damaged_frame_alone_is_described_again_and_other_settings_restart(twice, params, whole, tmp_path):
     recording, odometry = twice
     options, log = {"config": CONFIG, "kept_in": tmp_path / "kept"}, tmp_path / "kept" / checkpoint.LOG
@@ -174,7 +193,6 @@ def test_registration_stops_between_loops_and_goes_on(twice, params, tmp_path, m
         return Registration(initial, np.eye(6), 0.9)
 
     monkeypatch.setattr(acceptance, "register", registered)
-    monkeypatch.setattr(search, "check_installed", lambda: None)
     options = {"odometry": odometry, "config": CONFIG, "registered": True, "kept_in": tmp_path / "kept"}
     stopped = find_loops(recording, params, **options, should_stop=lambda: len(done) >= 2)
     overlaps = [loop.overlap for loop in stopped.loops]

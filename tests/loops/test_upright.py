@@ -1,14 +1,17 @@
 """A sensor that is tilted or hangs upside down: poses handed out are those of its own frame, as its points are."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import reading_scans
+from recordings import of_scans, reading_scans
 from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, upright_from_lidar
-from sglpr_jax.loops.closure import LoopClosure, planar_loop, to_lidar, to_upright
+from sglpr_jax.loops.acceptance import register_loops
+from sglpr_jax.loops.closure import UNKNOWN_HEIGHT_M, LoopClosure, planar_loop, to_lidar, to_upright
+from sglpr_jax.loops.result import LoopSearchResult, Session
 from sglpr_jax.loops.search import find_loops
 from sglpr_jax.maps.build import map_recording
 from sglpr_jax.maps.place_map import PlaceMap
@@ -50,13 +53,9 @@ def error_of(found: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
 
 @pytest.mark.slow
 def test_the_loops_of_a_tilted_recording_are_registered_and_agree_with_odometry_that_begins_with_the_identity(
-    drive, params
+    street, params
 ):
-    every_second = range(0, len(drive), 2)
-    parts = {name: tuple(getattr(drive, name)[i] for i in every_second) for name in ("ids", "paths")}
-    arrays = {name: getattr(drive, name)[::2] for name in ("positions", "times")}
-    recording, poses = tilted_drive(drive, TILTS["sideways"])
-    recording, poses = dataclasses.replace(recording, **parts, **arrays), poses[::2]
+    recording, poses = tilted_drive(street, TILTS["sideways"])
     found = find_loops(recording, params, odometry=inverse(poses[0]) @ poses, registered=True)
     assert len(found.loops) > 12 and len(found.rejected) <= 4
     for loop in found.loops:
@@ -95,6 +94,41 @@ def test_poses_go_there_and_back_and_points_with_them(degrees):
     in_match = transformed(of_lidar, cloud)
     np.testing.assert_allclose(mounting.level(in_match.astype(np.float32)), transformed(pose, level), atol=1e-4)
     np.testing.assert_array_equal(upright_from_lidar(None), np.eye(4))
+
+
+@pytest.mark.slow
+def test_scans_of_a_tilted_sensor_are_registered_like_those_of_a_level_one(drive, revisit):
+    query, match = revisit
+    poses = drive.poses.world_from_lidar
+    covariance = np.diag([0.1, 0.1, UNKNOWN_HEIGHT_M, 0.02, 0.02, 0.01]) ** 2
+    level = LoopClosure(query, match, inverse(poses[match]) @ poses[query], covariance, 1.0)
+    found = []
+    for degrees in (0.0, 30.0):
+        recording, _ = tilted_drive(drive, (0.0, degrees, 0.0))
+        raised = dataclasses.replace(recording.mounting, height_m=2.5)  # a height moves no points
+        recording = dataclasses.replace(recording, mounting=raised)
+        (loop,), _ = register_loops(
+            recording,
+            recording,
+            [to_lidar(level, query=recording.mounting, match=recording.mounting)],
+            knows_height=False,
+            should_stop=lambda: False,
+        )
+        assert not LoopSearchResult((Session(recording, len(recording)),)).is_degenerate(loop)
+        found.append(to_upright(loop, query=recording.mounting, match=recording.mounting))
+    metres, degrees = error_of(found[1].match_from_query, found[0].match_from_query)
+    assert metres < 0.005 and degrees < 0.02 and found[1].overlap == pytest.approx(found[0].overlap, abs=0.02)
+    deviations = [np.sqrt(np.diag(loop.covariance)) for loop in found]
+    np.testing.assert_allclose(deviations[1], deviations[0], rtol=0.1)
+
+
+def test_an_unknown_height_of_a_tilted_sensor_is_not_degenerate():
+    sensor = mounting_of(tilted_from_level((0.0, 15.0, 0.0)))
+    recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(2)}, mounting=sensor)
+    covariances = [np.diag([along_m, 0.1, 10.0, 0.02, 0.02, 0.01]) ** 2 for along_m in (0.1, 2.0)]
+    loops = [to_lidar(LoopClosure(1, 0, np.eye(4), each, 1.0), query=sensor, match=sensor) for each in covariances]
+    result = LoopSearchResult((Session(recording, 2),), tuple(loops))
+    assert list(map(result.is_degenerate, loops)) == [False, True] and str(result).startswith("2 loops (1 degenerate)")
 
 
 def test_odometry_of_a_tilted_sensor_is_laid_level_whatever_its_world():

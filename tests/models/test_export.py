@@ -19,9 +19,9 @@ TINY = model_preset("tiny")
 describe = jax.jit(sglpr_jax.describe)
 
 
-@pytest.fixture(scope="module", params=["tiny", "sglpr"])
-def params(request, random_params):
-    return random_params(model_preset(request.param))
+@pytest.fixture(scope="module")
+def params(random_params):
+    return random_params(model_preset("sglpr"))
 
 
 def images(params, n: int) -> np.ndarray:

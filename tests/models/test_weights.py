@@ -108,6 +108,14 @@ def test_weights_with_and_without_a_segmentation_head_are_grafted_onto_each_othe
         graft(params, dataclasses.replace(fresh, weights=kept))
 
 
+def test_only_kernels_may_grow(params):
+    weights = by_name(params.weights)
+    name = next(name for name in weights if name.endswith("/position_bias"))
+    fewer_rows = as_tree(weights | {name: weights[name][1:]})
+    with pytest.raises(ValueError, match="position_bias has shape"):
+        graft(dataclasses.replace(params, weights=fewer_rows), params)
+
+
 def with_fine_blocks(*channels):
     stem = CircularConfig(widths=(4, 6), strides=(2, 1), means=(1, 2), fine=channels)
     backbone = SglprConfig(stem=stem, depths=(), heads=())

@@ -39,7 +39,7 @@ def test_odometry_of_another_length_is_unusable_and_ambiguous_images_or_few_show
     assert checked(double, second=0.9).errors == (0.0, 0.0) == checked(double, steps=12).errors
 
 
-def test_a_scan_is_due_after_some_metres_some_degrees_or_some_frames():
+def test_a_scan_is_due_after_some_metres_or_some_degrees():
     check = OdometryCheck()
     check.add(np.eye(4), None)
     for pose, due in (
@@ -48,6 +48,3 @@ def test_a_scan_is_due_after_some_metres_some_degrees_or_some_frames():
         (transform(0.0, 0.0, 0.5), True),
     ):
         assert check.is_due(pose) == due
-    for _ in range(30):
-        check.skip()
-    assert check.is_due(np.eye(4))

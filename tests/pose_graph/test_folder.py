@@ -12,7 +12,9 @@ from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.files import DataWarning
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure
+from sglpr_jax.loops.frame_alignment import TrajectorySegment
 from sglpr_jax.loops.result import LoopSearchResult, Session
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.pose_graph.files import read_g2o, read_loops_jsonl
 from sglpr_jax.pose_graph.folder import FIRST_VERTEX, vertex_numbers, write_loop_folder
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
@@ -88,8 +90,20 @@ def test_one_graph_has_all_trajectories_in_one_frame_and_all_loops(pair, tmp_pat
     assert head[1] == "# tuesday: vertex = 1000000 + number of the scan; poses in the frame of monday"
 
 
+def test_edges_of_each_trajectory_have_the_drift_of_its_session(pair, tmp_path):
+    monday, tuesday = pair.sessions
+    tuesday = dataclasses.replace(tuesday, drift=DriftModel().scaled(10.0))
+    write_loop_folder(dataclasses.replace(pair, sessions=(monday, tuesday)), tmp_path)
+    edges = read_g2o(tmp_path / "loops.g2o").edges
+    first, second = edges[0][3], edges[len(monday.recording) - 1][3]  # of steps of 2 m
+    np.testing.assert_allclose(np.diag(first), 100 * np.diag(second), rtol=0.01)
+
+
 def test_rows_name_the_recordings_and_the_transform_is_in_frames_json(pair, tmp_path):
-    write_loop_folder(dataclasses.replace(pair, rejected=(RejectedClosure(pair.loops[0], "repeats"),)), tmp_path)
+    segment = TrajectorySegment(0, 100, 180, False)  # numbers of scans, not rows
+    transforms = (pair.transforms[0]._replace(match=segment),)
+    rejected = (RejectedClosure(pair.loops[0], "repeats"),)
+    write_loop_folder(dataclasses.replace(pair, rejected=rejected, transforms=transforms), tmp_path)
     loops = read_loops_jsonl(tmp_path / "loops.jsonl")
     assert [loop.query - FIRST_VERTEX for loop in loops] == [loop.query for loop in pair.loops]
     assert table(tmp_path / "loops.csv") == [(loop.query, loop.match) for loop in loops]
@@ -100,7 +114,8 @@ def test_rows_name_the_recordings_and_the_transform_is_in_frames_json(pair, tmp_
     frames = json.loads((tmp_path / "frames.json").read_text())
     assert [one["first_vertex"] for one in frames["recordings"]] == [0, FIRST_VERTEX]
     (written,) = frames["transforms"]
-    assert written["match_frame"]["frame"] == "odometry" and written["loops"] == len(loops)
+    assert written["match_frame"] == {"frame": "LiDAR at scan 100", "first": 100, "last": 180}
+    assert written["query_frame"]["frame"] == "odometry" and written["loops"] == len(loops)
     np.testing.assert_allclose(written["match_from_query"], pair.transforms[0].match_from_query)
 
 

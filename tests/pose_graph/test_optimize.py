@@ -12,9 +12,11 @@ from recordings import of_images
 from scipy.spatial.transform import Rotation
 from session_pairs import found_pair, two_drives
 
+from sglpr_jax.data.mounting import Mounting, upright_from_lidar
 from sglpr_jax.files import DataWarning
-from sglpr_jax.loops.closure import LoopClosure
+from sglpr_jax.loops.closure import LoopClosure, to_lidar
 from sglpr_jax.loops.result import LoopSearchResult, Session
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.pose_graph.files import read_g2o, write_g2o
 from sglpr_jax.pose_graph.optimize import (
     MAX_HEIGHT_CHANGE_M,
@@ -120,6 +122,20 @@ def test_sessions_fit_together_better_than_by_one_transform():
     assert trajectory_error(corrected.poses, truth) < 0.8 * before
 
 
+@pytest.mark.parametrize("worse", [0, 1])
+def test_loops_fit_the_drift_of_their_session_in_any_order(worse, two_laps, second_lap_loops):
+    """The odometry of one recording drifts ten times as much as usual, as its search has found."""
+    images = {Path(f"{i:06d}.png"): np.zeros((4, 4), np.float32) for i in range(LAPS_FRAMES)}
+    drifting = drifted(two_laps, percent=0, deg_per_100m=5)
+    sessions = [Session(of_images(images), 2, two_laps)] * 2
+    sessions[worse] = Session(of_images(images), 90, drifting, drift=DriftModel().scaled(10.0))
+    in_session = {"match_session": worse, "query_session": worse, "overlap": 0.9}
+    loops = [dataclasses.replace(loop, **in_session) for loop in second_lap_loops if loop.query < 90]
+    result = LoopSearchResult(tuple(sessions), tuple(loops), transforms=found_pair().transforms)
+    assert not solve_pose_graph({worse: drifting}, loops).inliers.any()
+    assert optimize_trajectory(result).inliers.all()
+
+
 def test_a_third_session_is_placed_through_the_second():
     pair = found_pair()
     (first,) = pair.transforms
@@ -131,6 +147,9 @@ def test_a_third_session_is_placed_through_the_second():
     found = placements(dataclasses.replace(chain, transforms=(around, second)))
     assert [group for group, _ in found] == [0, 0, 0]
     np.testing.assert_allclose(found[1][1], step @ inverse(step), atol=1e-9)
+    unused = first.query._replace(session=2, is_odometry=False)  # two parts of a session, each in its own frame
+    parts = first._replace(query=unused), second._replace(query=unused)
+    assert [group for group, _ in placements(dataclasses.replace(chain, transforms=parts))] == [0, 1, 2]
 
 
 def test_gtsam_reads_the_graph_that_we_write(two_laps_odometry, second_lap_loops, tmp_path):
@@ -173,3 +192,15 @@ def test_heights_that_move_by_metres_are_told(two_laps, two_laps_odometry, secon
     assert np.abs(corrected.poses[:, 2, 3] - low[:, 2, 3]).max() > MAX_HEIGHT_CHANGE_M
     registered = [dataclasses.replace(loop, overlap=0.9) for loop in second_lap_loops]
     optimize_trajectory(dataclasses.replace(moved, loops=tuple(registered)))  # without a warning
+
+
+def test_horizontal_corrections_of_a_tilted_sensor_are_no_changes_of_height(two_laps_odometry, second_lap_loops):
+    """The z axis of the first LiDAR frame points half forwards."""
+    mounting = Mounting(1.73, (-np.sqrt(0.5), 0.0, np.sqrt(0.5)))
+    images = {Path(f"{i:06d}.png"): np.zeros((4, 4), np.float32) for i in range(LAPS_FRAMES)}
+    lidar = two_laps_odometry @ upright_from_lidar(mounting)
+    odometry = inverse(lidar[0]) @ lidar
+    loops = [to_lidar(loop, query=mounting, match=mounting) for loop in second_lap_loops if loop.query < 90]
+    session = Session(of_images(images, mounting=mounting), 90, odometry)
+    corrected = optimize_trajectory(LoopSearchResult((session,), tuple(loops)))  # without a warning
+    assert np.abs(corrected.poses - odometry[:90])[:, 2, 3].max() > MAX_HEIGHT_CHANGE_M

@@ -3,6 +3,7 @@
 import numpy as np
 import pyarrow
 import pytest
+from lancedb.index import BTree
 
 from sglpr_jax import FleetIndex, Index
 from sglpr_jax.retrieval.fleet_index import TABLE
@@ -56,6 +57,7 @@ def test_a_place_is_added_once_and_all_processes_see_it(filled):
 def test_an_approximate_index_finds_nearest_places_and_those_added_later(tmp_path):
     index = FleetIndex(tmp_path)
     index.add(place_rows(file_of(600), "first", site="north"))
+    index.table.create_index("recording", config=BTree())  # of an `optimize` that was killed
     index.optimize()
     index.add(place_rows(file_of(30, seed=1), "later", site="south"))
     for _ in range(2):
@@ -63,7 +65,20 @@ def test_an_approximate_index_finds_nearest_places_and_those_added_later(tmp_pat
         assert index.query(draw(30, seed=1)[5])["place"].to_pylist() == ["later/frame5"]
         assert _names(index.query(draw(600)[5], where="site = 'south'"))[0][0] == "later"
         index.optimize()
-    assert {one.num_unindexed_rows for one in index.table.list_indices()} == {0}
+    assert {(*one.columns, one.num_unindexed_rows) for one in index.table.list_indices()} == {
+        (column, 0) for column in ("place", "recording", "time", "site", "descriptor")
+    }
+
+
+def test_an_index_opened_before_the_first_place_of_another_process_finds_it(tmp_path):
+    early, counting, others = FleetIndex(tmp_path), FleetIndex(tmp_path), FleetIndex(tmp_path, weights_hash="xyz")
+    for call in (lambda: early.query(draw(1)), early.optimize):
+        with pytest.raises(ValueError, match=rf"^{tmp_path}: expected an index with places, found none"):
+            call()
+    FleetIndex(tmp_path).add(place_rows(file_of(3), "first"))
+    assert early.query(draw(3)[1])["place"].to_pylist() == ["first/frame1"] and len(counting) == 3
+    with pytest.raises(ValueError, match="expected places with weights_hash xyz, found abc"):
+        others.query(draw(1))
 
 
 def test_places_of_other_weights_are_refused(filled):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.distance import cdist
 
-from sglpr_jax.se3 import distances
 from sglpr_jax.sim.drive import CARRIERS, PlanarPath, plan_path, poses_on, read_path, scan_rows
 from sglpr_jax.sim.ground import draw_relief, relief_height
 from sglpr_jax.sim.recording import simulate_repeating
@@ -24,7 +24,7 @@ def speeds(path: PlanarPath) -> np.ndarray:
 
 def revisits(trajectory) -> tuple[float, float, np.ndarray]:
     """Shares of the scans within 3 m of one 30 s older that heads the same and the opposite way; and when."""
-    apart = distances(trajectory.xy, trajectory.xy)
+    apart = cdist(trajectory.xy, trajectory.xy)
     apart[trajectory.times[:, None] - trajectory.times[None, :] < 30] = np.inf
     heading = np.cos(trajectory.yaw - trajectory.yaw[apart.argmin(1)])
     again = apart.min(1) <= 3

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from sglpr_jax.se3 import lengths_along
+
 RADIUS_M = 7.0
 LOOP = ((0, 0), (160, 0), (160, 90), (0, 90), (0, 0), (110, 0))
 """Around a block and on along the first street: 610 m, the last 110 m in the same direction as the first."""
@@ -18,6 +20,6 @@ def drive(corners, *, speed: float = 8.0, spacing: float = 0.8) -> tuple[np.ndar
         share = np.linspace(0, np.pi / 2, 20)[:, None]
         pieces.append(corner + RADIUS_M * ((1 - np.cos(share)) * leaving - (1 - np.sin(share)) * arriving))
     line = np.concatenate([*pieces, corners[-1:]])
-    travelled = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    travelled = lengths_along(line)
     at = np.arange(0, travelled[-1], spacing)
     return np.stack([np.interp(at, travelled, axis) for axis in line.T], axis=1), at / speed

@@ -251,6 +251,12 @@ def test_the_best_of_three_rates_is_found_and_recorded(data, held_out, tmp_path)
     assert found["recall_at_1"][f"{best:g}"] == max(found["recall_at_1"].values())
     assert best_rate(TINY, data, score, tmp_path, **options) == best  # nothing is trained again
     assert json.loads((tmp_path / "rates.json").read_text()) == found
+    scores = json.loads((tmp_path / "rate-0.01/score.json").read_text())
+    assert scores["scored"]["held_out"] == [{"name": "c", "scans": 60}]
+    other = held_out_score(TINY, prepare_inputs(TINY, [loop("d", 3)], tmp_path / "cache"))
+    best_rate(TINY, data, other, tmp_path, seconds=0.6)  # the trainings continue and are scored again
+    again = json.loads((tmp_path / "rate-0.01/score.json").read_text())
+    assert again["scored"]["step"] > scores["scored"]["step"] and "recall_at_1 d" in again
 
 
 def test_damaged_and_foreign_weights_are_errors(tmp_path):

@@ -81,6 +81,12 @@ def test_three_metres_are_too_far_for_a_positive_and_twenty_too_near_for_a_negat
     np.testing.assert_array_equal(pool.far_apart(np.array(0), np.arange(5)), [False, False, False, False, True])
 
 
+def test_a_positive_is_no_negative_of_its_anchor():
+    TupleConfig(positive_m=20.0, negative_m=20.0)
+    with pytest.raises(ValueError, match=r"negative_m of at least sampling\.positive_m, 25\.0, found 20\.0"):
+        TupleConfig(positive_m=25.0)
+
+
 def test_a_batch_is_a_pure_function_of_seed_and_step():
     pool = TuplePool([circuit(3)], TupleConfig(revisit_gap=LAP // 2))
     rows = pool.draw(seed=1, step=2, tuples=4)

@@ -102,6 +102,9 @@ MAX_DIRECTION_DIFFERENCE = 0.12
 """Maximum difference of the distributions of directions between rows of a period (Kolmogorov-Smirnov statistic)."""
 MAX_DISTANCE_RATIO = 8.0
 """Maximum ratio of the median distances between rows of a period."""
+MIN_AXES_DIFFERENCE = 0.1
+"""Minimum difference of the distributions of x, y and z (largest Kolmogorov-Smirnov statistic of two of them). In scans
+it is above 0.4. If the columns of a file follow one another, "x", "y" and "z" are samples of one column."""
 SCALED_M = 1.0
 """Clouds whose coordinates are all within this limit are considered scaled, not in metres."""
 MIN_POINTS, MAX_POINTS = 200, 20_000
@@ -201,7 +204,12 @@ def _implausible(points: Float[np.ndarray, "n 3"]) -> str:
         return f"half of the points beyond {MAX_MEDIAN_DISTANCE_M:g} m"
     if np.abs(points).max() <= SCALED_M:
         return f"all points within {SCALED_M:g} m, as in scaled clouds"
-    return "all points with the same x or y" if np.ptp(points[:, :2], axis=0).min() < 0.1 else ""
+    if np.ptp(points[:, :2], axis=0).min() < 0.1:
+        return "all points with the same x or y"
+    x, y, z = np.sort(points.T)
+    if max(_kolmogorov_smirnov(a, b) for a, b in ((x, y), (y, z), (z, x))) < MIN_AXES_DIFFERENCE:
+        return "x, y and z distributed alike, as in files with one column after the other"
+    return ""
 
 
 def _periodic(clouds: Sequence[Float[np.ndarray, "_ 3"]], period: int) -> str:

@@ -29,25 +29,42 @@ TIME_COLUMNS_S = ("t_s", "time_s", "timestamp_s", "seconds")
 """Names with a unit. They are used if the file has no column named in `TIME_COLUMNS`."""
 
 
-def check_positions(path: Path, positions: Float[np.ndarray, "n 3"]) -> None:
-    """Raise ValueError, with the row in `path`, if a coordinate exceeds `FARTHEST_POSITION_M` (1e8 m)."""
+def check_positions(source: Path | str, positions: Float[np.ndarray, "n 3"]) -> None:
+    """Raise ValueError, with the row in `source`, if a coordinate exceeds `FARTHEST_POSITION_M` (1e8 m)."""
     far_rows = np.flatnonzero(np.abs(positions).max(axis=1, initial=0) > FARTHEST_POSITION_M)
     if far_rows.size:
         found = f"{positions[far_rows[0]].tolist()} in row {far_rows[0] + 1}"
-        raise ValueError(f"{path}: expected positions in metres, up to {FARTHEST_POSITION_M:g}, found {found}")
+        raise ValueError(f"{source}: expected positions in metres, up to {FARTHEST_POSITION_M:g}, found {found}")
 
 
 def quaternion_poses(
-    path: Path, positions: Float[np.ndarray, "n 3"], quaternions: Float[np.ndarray, "n 4"]
+    source: Path | str, positions: Float[np.ndarray, "n 3"], quaternions: Float[np.ndarray, "n 4"]
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Return poses from positions in metres and quaternions x, y, z, w. Errors name the invalid row in `path`."""
-    check_positions(path, positions)
+    """Return poses from positions in metres and quaternions x, y, z, w. Errors name the invalid row in `source`."""
+    check_positions(source, positions)
     invalid_rows = np.flatnonzero(~have_unit_length(quaternions))
     if invalid_rows.size:
         found = " ".join(f"{value:g}" for value in quaternions[invalid_rows[0]])
         row = f"row {invalid_rows[0] + 1}"
-        raise ValueError(f"{path}: expected a rotation qx qy qz qw of length 1 in {row}, found {found}")
+        raise ValueError(f"{source}: expected a rotation qx qy qz qw of length 1 in {row}, found {found}")
     return from_quaternions(positions, quaternions)
+
+
+def matrix_poses(
+    source: Path | str, rows: Float[np.ndarray, "n 12"], *, camera: bool = True
+) -> Float[np.ndarray, "n 4 4"]:
+    """Return poses from 12 numbers a row, in KITTI's camera axes (converted to z up) or, with `camera=False`, z up.
+
+    Errors name the invalid row in `source`.
+    """
+    matrices = rows.reshape(-1, 3, 4)
+    invalid_rows = np.flatnonzero(~are_rotations(matrices[:, :, :3]))
+    if invalid_rows.size:
+        found = " ".join(f"{value:g}" for value in matrices[invalid_rows[0]].ravel())
+        raise ValueError(f"{source}: expected a rotation and a translation in row {invalid_rows[0] + 1}, found {found}")
+    check_positions(source, matrices[:, :, 3])
+    poses = poses_of(matrices[:, :, 3], matrices[:, :, :3])
+    return CAMERA_FROM_LIDAR.T @ poses @ CAMERA_FROM_LIDAR if camera else poses
 
 
 def read_times(path: Path, *, unit: TimeUnit = "auto") -> Float[np.ndarray, " n"] | None:
@@ -69,14 +86,7 @@ def read_tum(
 
 def read_kitti(path: Path, *, camera: bool = True) -> Float[np.ndarray, "n 4 4"]:
     """Read poses from 12 numbers a line, in KITTI's camera axes (converted to z up) or, with `camera=False`, z up."""
-    matrices = read_rows(path, columns=12).reshape(-1, 3, 4)
-    invalid_rows = np.flatnonzero(~are_rotations(matrices[:, :, :3]))
-    if invalid_rows.size:
-        found = " ".join(f"{value:g}" for value in matrices[invalid_rows[0]].ravel())
-        raise ValueError(f"{path}: expected a rotation and a translation in row {invalid_rows[0] + 1}, found {found}")
-    check_positions(path, matrices[:, :, 3])
-    poses = poses_of(matrices[:, :, 3], matrices[:, :, :3])
-    return CAMERA_FROM_LIDAR.T @ poses @ CAMERA_FROM_LIDAR if camera else poses
+    return matrix_poses(path, read_rows(path, columns=12), camera=camera)
 
 
 def rows_of_frames(rows: Float[np.ndarray, "m ..."], ids: Sequence[str], *, path: Path) -> Float[np.ndarray, "n ..."]:
@@ -124,9 +134,14 @@ def _lines(path: Path, *, expected: str, skip: int) -> Iterator[tuple[str, str]]
     """Yield location ("FILE, line 3") and content of the lines after `skip` header lines, without lines with #."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected {expected}, found none")
-    for number, line in enumerate(path.read_text(errors="replace").rstrip().splitlines(), start=1):
+    for number, line in enumerate(_text_of(path).rstrip().splitlines(), start=1):
         if number > skip and not line.startswith("#"):
             yield f"{path}, line {number}", line
+
+
+def _text_of(path: Path) -> str:
+    """Return the text of a file without the byte order mark that Excel writes."""
+    return path.read_text(encoding="utf-8-sig", errors="replace")
 
 
 def _parse_integer_time(word: str, *, where: str) -> np.int64:
@@ -215,7 +230,7 @@ def read_trajectory(
     positions = poses[:, :3, 3]
     if not len(positions):
         raise ValueError(f"{path}: expected at least one pose, found none")
-    warn_of_heights(positions, path=path)
+    warn_of_heights(positions, source=path)
     if times is not None:
         seconds = read_times(times, unit=time_unit)
         if seconds is not None and len(seconds) != len(positions):
@@ -225,12 +240,12 @@ def read_trajectory(
     return Trajectory(positions, seconds, source, by_row=times is not None, rotations=rotations)
 
 
-def warn_of_heights(positions: Float[np.ndarray, "n 3"], *, path: Path) -> None:
+def warn_of_heights(positions: Float[np.ndarray, "n 3"], *, source: Path | str) -> None:
     """Warn if z ranges over more than `MAX_HEIGHT_RANGE_M` and more than x or y: the axes are probably wrong."""
     x_range, y_range, z_range = np.ptp(positions, axis=0)
     if z_range > MAX_HEIGHT_RANGE_M and z_range > min(x_range, y_range):
         warn(
-            f"{path}: expected z up, found heights over {z_range:.0f} m and {x_range:.0f} x {y_range:.0f} m on the"
+            f"{source}: expected z up, found heights over {z_range:.0f} m and {x_range:.0f} x {y_range:.0f} m on the"
             " ground; are the poses in another frame (kitti: camera axes, lidar: z up)?"
         )
 
@@ -261,7 +276,7 @@ def detect_pose_format(path: Path, *, twelve_numbers: Literal["kitti", "lidar"] 
     """Return the format of a pose file: csv by its ending, tum by 8 numbers a line, `twelve_numbers` by 12."""
     if path.suffix == ".csv":
         return "csv"
-    lines = path.read_text(errors="replace").splitlines()
+    lines = _text_of(path).splitlines()
     first_line = next((line for line in lines if line.strip() and not line.startswith("#")), "")
     columns = len(first_line.split())
     if columns == 12 and twelve_numbers is not None:
@@ -277,7 +292,7 @@ def detect_pose_format(path: Path, *, twelve_numbers: Literal["kitti", "lidar"] 
 
 def _read_csv(path: Path, unit: TimeUnit) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, " n"] | None]:
     """Read poses (with identity rotations) and times in seconds, if any, from the named columns of a csv file."""
-    header = path.read_text(errors="replace").partition("\n")[0]
+    header = _text_of(path).partition("\n")[0]
     names = [name.strip().lower() for name in header.removeprefix("#").split(",")]  # numpy.savetxt writes the #
     time_names = [name for name in names if name in TIME_COLUMNS] or [name for name in names if name in TIME_COLUMNS_S]
     if not {"x", "y", "z"} <= set(names):

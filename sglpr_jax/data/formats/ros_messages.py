@@ -32,6 +32,12 @@ LIVOX_FIELDS = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectiv
 """Fields of a point of Livox, and their numpy types."""
 IMU = "sensor_msgs/msg/Imu"
 """Message type of an IMU."""
+CLOCKS_APART_S = 5.0
+"""Minimum difference between the delays of two topics, from header to recorder, if their clocks differ, in seconds.
+Most SLAM programs are late by less."""
+MOST_LATE = 0.01
+"""Maximum fraction of messages whose header time is before that of an earlier message. More show a clock that was set
+back."""
 
 
 class Header(NamedTuple):
@@ -207,15 +213,27 @@ class Stamps(NamedTuple):
         return cls(np.array([pair[0] for pair in pairs], np.int64), np.array([pair[1] for pair in pairs], np.float64))
 
     @property
-    def headers_are_valid(self) -> bool:
-        """Whether the header times are positive, never decrease, and can be seconds (`times.time_unit_problem`)."""
-        ordered = len(self.header_s) and (self.header_s > 0).all() and (np.diff(self.header_s) >= 0).all()
-        return bool(ordered and not time_unit_problem(self.header_s, numbers=False))
+    def recorder_s(self) -> Float[np.ndarray, " n"]:
+        """Times at which the recorder received the messages, in seconds."""
+        return self.recorder_ns / 1e9
+
+    @property
+    def delay_s(self) -> float:
+        """Median time from header to recorder, in seconds."""
+        return float(np.median(self.recorder_s - self.header_s))
+
+    def headers_are_valid(self, *, most_late: float = 0.0) -> bool:
+        """Whether the header times are positive and can be seconds (`times.time_unit_problem`), and at most the
+        fraction `most_late` of them is before the time of an earlier message."""
+        if not len(self.header_s) or not (self.header_s > 0).all():
+            return False
+        is_late = self.header_s < np.maximum.accumulate(self.header_s)
+        return bool(is_late.mean() <= most_late) and not time_unit_problem(np.sort(self.header_s), numbers=False)
 
     @property
     def seconds(self) -> Float[np.ndarray, " n"]:
         """Header times in seconds if all are valid, or else the recorder's times."""
-        return self.header_s if self.headers_are_valid else self.recorder_ns / 1e9
+        return self.header_s if self.headers_are_valid() else self.recorder_s
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -285,12 +303,25 @@ def tracks_of_transforms(transforms: Iterable[tuple[int, StampedPose]]) -> list[
     return [Track.of(poses) for _, poses in sorted(groups.items())]
 
 
-def times_on_one_clock(messages: Stamps, scans: Stamps) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " q"]]:
-    """Return the times of messages and of scans in seconds: header times, or recorder times if those do not overlap."""
-    valid = scans.headers_are_valid and messages.headers_are_valid
-    if valid and have_poses(messages.header_s, scans.header_s).mean() >= LEAST_SHARE:
+def times_on_one_clock(
+    messages: Stamps, scans: Stamps, *, source: str
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " q"]]:
+    """Return the times of messages, in any order, and of scans in seconds: header times if they have one clock, or else
+    recorder times. Warns, with the name `source` of the messages, if header times overlap but have two clocks."""
+    valid = scans.headers_are_valid() and messages.headers_are_valid(most_late=MOST_LATE)
+    if not valid or have_poses(messages.header_s, scans.header_s).mean() < LEAST_SHARE:
+        return messages.recorder_s, scans.recorder_s
+    if abs(messages.delay_s - scans.delay_s) <= CLOCKS_APART_S:
         return messages.header_s, scans.header_s
-    return messages.recorder_ns / 1e9, scans.recorder_ns / 1e9
+    # A slow SLAM program is late, but copies the times of the scans. Those of another pass were recorded later.
+    are_copied = np.isin(messages.header_s, scans.header_s).mean() >= LEAST_SHARE
+    if are_copied or have_poses(messages.recorder_s, scans.recorder_s).mean() < LEAST_SHARE:
+        return messages.header_s, scans.header_s
+    warn(
+        f"{source}: expected header times on the clock of the scans, found messages recorded {messages.delay_s:.1f} s "
+        f"after their header time, and scans {scans.delay_s:.1f} s after theirs; the times of the recorder are used"
+    )
+    return messages.recorder_s, scans.recorder_s
 
 
 def static_transform(tracks: Iterable[Track], frame: str, other: str) -> Float[np.ndarray, "4 4"] | None:

@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -86,6 +86,16 @@ ENDINGS = (".bin", ".pcd", ".ply")
 """File endings of scans."""
 ARRAY_ENDINGS = (".npy", ".npz", ".las")
 """File endings of scans in folders without `ENDINGS`. In other folders, such files are descriptors, poses or maps."""
+
+
+def scan_names(names: Iterable[str]) -> list[str]:
+    """Return the names in a folder that have one of `ENDINGS`, in any case, or else one of `ARRAY_ENDINGS`.
+
+    Hidden files are skipped, as in `listing.files_in`.
+    """
+    visible = [name for name in names if not name.startswith(".")]
+    of_kinds = ([name for name in visible if name.lower().endswith(kind)] for kind in (ENDINGS, ARRAY_ENDINGS))
+    return next(filter(None, of_kinds), [])
 
 
 def scan_id(path: Path) -> str:

@@ -10,6 +10,7 @@ import pkgutil
 from pathlib import Path
 
 from sglpr_jax.data.choices import Gravity, PoseChoice, PoseFormat, ScanFormat, SensorHeight, TimeUnit
+from sglpr_jax.data.formats.pose_files import warn_of_heights
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS
 from sglpr_jax.data.gravity import mounted
 from sglpr_jax.data.readers.listing import describe_contents
@@ -68,12 +69,13 @@ def open_recording(
       pose_format: Format of the pose file.
       times: File of timestamps of a plain folder, if it is not beside the scans.
       time_unit: Unit of the times in text files. "auto" expects seconds.
-      pose_topic: Pose topic of a bag, by default the topic that covers the largest number of scans.
+      pose_topic: Pose topic of a bag, by default the topic that covers the largest number of scans, "" for no poses.
       imu_topic: IMU topic of a bag, for the gravity of each scan, by default the one beside the LiDAR's topic.
 
     Raises:
       FileNotFoundError: If the sequence or one of its files is missing.
-      ValueError: If a file is malformed, times decrease, or `poses`, `times` or a topic does not apply to the layout.
+      ValueError: If a file is malformed, times decrease, or `format`, `poses`, `pose_format`, `times` or a topic does
+        not apply to the layout.
       ImportError: If `root` is a bag and the extra `ros` is not installed.
 
     Example:
@@ -86,29 +88,24 @@ def open_recording(
     if name is None or name not in names:
         expected = "the name of one sequence" if name is None else f"sequence {name!r}"
         raise FileNotFoundError(f"{root}: expected {expected}, found {', '.join(names)}")
-    pose_file = None if poses is None else Path(poses)
-    times_file = None if times is None else Path(times)
-    if (pose_file or times_file) and not reader.takes_poses:
-        expected = "poses or times for a plain folder of scans"
-        raise ValueError(f"{pose_file or times_file}: expected {expected}, found {root}: {reader.layout}")
-    for kind, topic in (("pose", pose_topic), ("IMU", imu_topic)):
-        if topic is not None and not reader.takes_topics:
-            raise ValueError(f"{root}: expected a bag with the {kind} topic {topic}, found {reader.layout}")
     options = ReadOptions(
         pose_source=pose_source,
         format=format,
-        poses=pose_file,
+        poses=None if poses is None else Path(poses),
         pose_format=pose_format,
-        times=times_file,
+        times=None if times is None else Path(times),
         time_unit=time_unit,
         pose_topic=pose_topic,
         imu_topic=imu_topic,
     )
+    reader.check_options(root, options)
     recording = reader.open(root, name, options)
     recording = dataclasses.replace(recording, world=simulated_world(root, name) or recording.world)
     if recording.times is not None:
         check_order(recording.times, source=f"{root}, sequence {name}")
         check_jumps(recording.times, source=f"{root}, sequence {name}")
+    if recording.positions is not None and len(recording) and not reader.takes_poses:  # others check the pose file
+        warn_of_heights(recording.positions, source=f"{root}, sequence {name}")
     dataset = root / name.rpartition("/")[0]  # a recording in a folder of datasets is called DATASET/NAME
     is_known = reader.knows_mounting and not is_in_a_hand(dataset)
     return mounted(recording, sensor_height, gravity=gravity, known=is_known)

@@ -17,8 +17,10 @@ def _names(root: Path) -> tuple[str, ...]:
 
 def _open(root: Path, name: str, options: ReadOptions) -> Recording:
     dataset, _, inner_name = name.partition("/")
-    recording = find_reader(root / dataset)[0].open(root / dataset, inner_name, options)  # the caller adds the mounting
+    reader = find_reader(root / dataset)[0]
+    reader.check_options(root / dataset, options)
+    recording = reader.open(root / dataset, inner_name, options)  # the caller adds the mounting
     return dataclasses.replace(recording, name=name, world=simulated_world(root / dataset, inner_name))
 
 
-READER = Reader(f"DATASET/{SIMULATION} (datasets of bin/simulate)", _names, _open)
+READER = Reader(f"DATASET/{SIMULATION} (datasets of bin/simulate)", _names, _open, takes_format=True)

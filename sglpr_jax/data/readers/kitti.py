@@ -74,5 +74,9 @@ def _choose_pose_file(root: Path, name: str, choice: PoseChoice) -> str | None:
 
 
 READER = Reader(
-    "sequences/NN/velodyne/*.bin (KITTI)", partial(names_of, pattern="sequences/*/velodyne/"), open_recording, rank=0
+    "sequences/NN/velodyne/*.bin (KITTI)",
+    partial(names_of, pattern="sequences/*/velodyne/"),
+    open_recording,
+    rank=0,
+    takes_format=True,
 )

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from decimal import Decimal
 from pathlib import Path
 
-_DECIMAL = re.compile(r"(\d+\.\d+)(\.[A-Za-z]\w*)*$")
-"""File name that is a decimal number, such as a timestamp, with its extensions: 1561000444.39.bin."""
+_DECIMAL = re.compile(r"(?P<prefix>(?:.*[^\d.])?)(?P<number>\d+\.\d+)(\.[A-Za-z]\w*)*$")
+"""File name that ends with a decimal number, such as a timestamp, and its extensions: scan_1561000444.39.bin."""
 
 
 def files_in(folder: Path, *endings: str) -> tuple[Path, ...]:
@@ -39,12 +39,13 @@ def names_of(root: Path, *, pattern: str) -> tuple[str, ...]:
 def in_natural_order(paths: Iterable[Path]) -> tuple[Path, ...]:
     """Sort paths by name, with numbers compared as numbers: full2 before full10.
 
-    If all names are decimal numbers, such as timestamps, they are compared as decimals: 1.25 before 1.5.
+    If all names are decimal numbers after the same prefix, such as timestamps, the numbers are compared as decimals:
+    scan_1.25 before scan_1.5.
     """
     files = list(paths)
-    decimals = {path: match[1] for path in files if (match := _DECIMAL.match(path.name))}
-    if len(decimals) == len(files):
-        return tuple(sorted(files, key=lambda path: (Decimal(decimals[path]), path.name)))
+    decimals = {path: match for path in files if (match := _DECIMAL.match(path.name))}
+    if len(decimals) == len(files) and len({match["prefix"] for match in decimals.values()}) == 1:
+        return tuple(sorted(files, key=lambda path: (Decimal(decimals[path]["number"]), path.name)))
     return tuple(sorted(files, key=lambda path: _natural_key(path.name)))
 
 

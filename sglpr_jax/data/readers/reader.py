@@ -42,6 +42,22 @@ class Reader:
     rank: int = 5
     """Priority if several layouts fit a folder: the lowest rank, then the alphabetical order of the modules."""
     takes_poses: bool = False
-    """Whether `ReadOptions.poses` and `times` apply. Otherwise the layout has its own pose files."""
+    """Whether `ReadOptions.poses`, `pose_format` and `times` apply. Otherwise the layout has its own pose files."""
+    takes_format: bool = False
+    """Whether `ReadOptions.format` applies. Otherwise the layout defines the format of the scans."""
     takes_topics: bool = False
     """Whether `ReadOptions.pose_topic` and `imu_topic` apply."""
+
+    def check_options(self, root: Path, options: ReadOptions) -> None:
+        """Raise ValueError if an option for `root` does not apply to the layout."""
+        file = options.poses or options.times
+        if file and not self.takes_poses:
+            expected = "poses or times for a plain folder of scans"
+            raise ValueError(f"{file}: expected {expected}, found {root}: {self.layout}")
+        for kind, topic in (("pose", options.pose_topic), ("IMU", options.imu_topic)):
+            if topic and not self.takes_topics:
+                raise ValueError(f"{root}: expected a bag with the {kind} topic {topic}, found {self.layout}")
+        for name, applies in (("pose_format", self.takes_poses), ("format", self.takes_format)):
+            value = getattr(options, name)
+            if value != "auto" and not applies:
+                raise ValueError(f"{root}: expected {name} 'auto' for the layout {self.layout}, found {value!r}")

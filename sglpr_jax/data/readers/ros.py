@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.formats.pose_files import warn_of_heights, warn_of_jumps
+from sglpr_jax.data.formats.pose_files import warn_of_jumps
 from sglpr_jax.data.formats.ros_bag import CLOUDS, COMPRESSED, METADATA, RosBag
 from sglpr_jax.data.formats.ros_messages import (
     IMU,
@@ -128,12 +128,17 @@ def _split_into_drives(bag: RosBag) -> list[RosBag]:
 
 def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | None, lidar_frame: str) -> Recording:
     """Add the poses of `topic`, or of the topic that covers most scans (at least half), and drop the other scans."""
+    if topic == "":  # no poses are wanted
+        return recording
     transforms = _read_tf_tracks(bag)
     tracks = {name: _read_track(bag, name) for name in bag.topics_of(POSES)}
     for track in transforms:  # tf has poses of the LiDAR if a moving frame is connected with the LiDAR's frame
         if track.moves and static_transform(transforms, track.child, lidar_frame) is not None:
             tracks[f"/tf/{track.frame}/{track.child}"] = track
-    times = {name: times_on_one_clock(track.stamps, scans) for name, track in tracks.items()}
+    times = {
+        name: times_on_one_clock(track.stamps, scans, source=f"{bag.paths[0]}, {name}")
+        for name, track in tracks.items()
+    }
     has_pose = {name: have_poses(pose_times, scan_times) for name, (pose_times, scan_times) in times.items()}
     shares = {name: float(rows.mean()) for name, rows in has_pose.items()}
     used = _pose_topic(shares, topic, bag.paths[0])
@@ -148,7 +153,6 @@ def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | N
         warn(f"{bag.paths[0]}: expected valid poses on {used}, found {found}; these are dropped")
     pose_times, scan_times = times[used]
     world_from_child = interpolate_poses(pose_times, track.poses, scan_times[rows])
-    warn_of_heights(world_from_child[:, :3, 3], path=bag.paths[0])
     warn_of_jumps(world_from_child[:, :3, 3], [recording.ids[i] for i in rows], path=bag.paths[0])
     child_from_lidar, how = _child_from_lidar(track, transforms, lidar_frame)
     world_from_lidar = world_from_child @ child_from_lidar
@@ -221,8 +225,8 @@ def _read_ups(
     """
     stamps, imu_frame, imu = bag.read(topic, read_imu)
     imu_frame = imu_frame.strip("/")
-    imu_times, scan_times = times_on_one_clock(stamps, scans)
     source = f"{bag.paths[0]}, {topic}"
+    imu_times, scan_times = times_on_one_clock(stamps, scans, source=source)
     try:
         with naming(source):
             ups_in_imu, how = imu.with_times(imu_times).ups(scan_times)

@@ -5,6 +5,7 @@
 - `my_scans/times.txt`: timestamps, one number a line, in seconds unless `time_unit` names another unit.
 """
 
+import os
 from functools import partial
 from pathlib import Path
 
@@ -19,11 +20,12 @@ from sglpr_jax.data.formats.scan_files import (
     ENDINGS,
     format_by_name,
     scan_id,
+    scan_names,
     scan_of_file,
     warn_of_doubts,
 )
 from sglpr_jax.data.poses import poses_at_scans
-from sglpr_jax.data.readers.listing import describe_contents, files_in
+from sglpr_jax.data.readers.listing import describe_contents, in_natural_order
 from sglpr_jax.data.readers.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
 
@@ -66,7 +68,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
 
 def _scan_files(root: Path) -> tuple[Path, ...]:
     """Return the scan files in a folder: .bin, .pcd and .ply or, without such files, .npy, .npz and .las."""
-    return files_in(root, *ENDINGS) or files_in(root, *ARRAY_ENDINGS)
+    return in_natural_order(root / name for name in scan_names(os.listdir(root))) if root.is_dir() else ()
 
 
 def _read_trajectory(
@@ -129,4 +131,5 @@ READER = Reader(
     knows_mounting=False,
     rank=9,
     takes_poses=True,
+    takes_format=True,
 )

@@ -7,12 +7,12 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial.distance import cdist
 
 from sglpr_jax.evaluation.protocols.protocol import Kind, Protocol, ScoredPairs, positions_of
 from sglpr_jax.evaluation.protocols.result import Result, with_f1_max
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function
-from sglpr_jax.se3 import distances
 
 POSITIVE_M, NEGATIVE_M = 3.0, 20.0
 """Frames closer than `POSITIVE_M` metres show the same place, frames farther apart than `NEGATIVE_M` different ones."""
@@ -176,7 +176,7 @@ def _selected_in_blocks(
     n = len(positions)
     for start in range(0, n, BLOCK):
         i_minus_j = np.arange(start, min(start + BLOCK, n))[:, None] - np.arange(n)[None, :]
-        yield start * n, is_selected(distances(positions[start : start + BLOCK], positions), i_minus_j)
+        yield start * n, is_selected(cdist(positions[start : start + BLOCK], positions), i_minus_j)
 
 
 def pair_distances(file: DescriptorFile, pairs: Int[np.ndarray, "2 pairs"]) -> Float[np.ndarray, " pairs"]:

@@ -9,12 +9,13 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter1d
 
+from sglpr_jax.se3 import lengths_along
 from sglpr_jax.sim.drive import shifted, waves
 from sglpr_jax.sim.ground import CELL_M, Ground, Relief, draw_relief
 from sglpr_jax.sim.labels import BUILDING, OTHER_GROUND, TERRAIN
 from sglpr_jax.sim.objects import ObjectModel, Primitive, block
 from sglpr_jax.sim.placement import HEAD_ROOM_M, Spot, distances, place, to_scene
-from sglpr_jax.sim.routes import Line, Revisit, lengths_along, resampled
+from sglpr_jax.sim.routes import Line, Revisit, resampled
 from sglpr_jax.sim.world import Levels, World
 
 STEP_M = 0.1  # distance between two points of a line, in metres
