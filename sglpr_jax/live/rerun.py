@@ -33,6 +33,7 @@ class RerunSink:
     def __init__(self, stream: Any):
         """Take a `rerun.RecordingStream`. `close` disconnects it."""
         self._stream, self._checked_at = stream, time.monotonic()
+        self._odometry_frame = 0  # `LoopEdge.odometry_frame` of the last loop
         self._stream.log("map", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     def frame(self, status: FrameStatus) -> None:
@@ -51,11 +52,15 @@ class RerunSink:
                     raise
 
     def loop(self, edge: LoopEdge) -> None:
-        """Write a loop as text, and draw a line between the positions of its scans."""
+        """Write a loop as text, and draw a line between the positions of its scans. Lines in an earlier odometry frame
+        are cleared."""
         self._set_time(edge.query, edge.query_time)
         text = f"query {edge.query}, match {edge.match}: probability {edge.probability:.4f}"
         self._stream.log("loops", rerun.TextLog(text))
         self._plot("probability/loop", edge.probability)
+        if edge.odometry_frame != self._odometry_frame:
+            self._odometry_frame = edge.odometry_frame
+            self._stream.log("map/loops", rerun.Clear(recursive=True))
         if edge.world_from_query is not None and edge.world_from_match is not None:
             ends = np.stack([edge.world_from_match[:3, 3], edge.world_from_query[:3, 3]])
             self._stream.log(f"map/loops/{edge.query}", rerun.LineStrips3D([ends], colors=[LOOP_COLOUR], labels=[text]))
