@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import safetensors.numpy
+import tyro
 from jaxtyping import Shaped
 
 from benchmarks.timing import run_command

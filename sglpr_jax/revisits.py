@@ -17,7 +17,7 @@ Near = Callable[[Float[np.ndarray, "..."]], Bool[np.ndarray, "..."]]
 
 
 def close_pairs(positions: Float[np.ndarray, "n d"], *, closer_than_m: float) -> Int[np.ndarray, "pairs 2"]:
-    """Return every pair of frames less than `closer_than_m` metres apart, once each, in any order."""
+    """Return every pair of frames less than `closer_than_m` metres apart, once each, the earlier frame first."""
     largest_m = np.nextafter(closer_than_m, 0)  # because `query_pairs` includes pairs at this distance
     return KDTree(positions).query_pairs(largest_m, output_type="ndarray")
 

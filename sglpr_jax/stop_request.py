@@ -5,6 +5,7 @@ import dataclasses
 import signal
 import sys
 from collections.abc import Iterator
+from typing import NoReturn
 
 
 @dataclasses.dataclass
@@ -22,7 +23,7 @@ class StopRequest:
         """130 after Ctrl-C, as in shells. 0 after SIGTERM, which ends a run that will be resumed later."""
         return 130 if self.signal == signal.SIGINT else 0
 
-    def exit(self, message: str) -> None:
+    def exit(self, message: str) -> NoReturn:
         """Print the message on stderr and exit with the status of the signal."""
         print(message, file=sys.stderr, flush=True)
         sys.exit(self.exit_status)

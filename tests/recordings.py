@@ -1,4 +1,4 @@
-"""Recordings for the tests: points and images in memory, labels in files; and what a file for rerun holds."""
+"""Recordings for the tests: points and images in memory, labels in files. Also lists entities of a file for rerun."""
 
 import dataclasses
 import subprocess

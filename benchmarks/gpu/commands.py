@@ -26,7 +26,7 @@ from sglpr_jax.training.callbacks import ProgressBar
 from sglpr_jax.training.config import TrainConfig
 from sglpr_jax.training.metrics_log import read_metrics
 from sglpr_jax.training.presets import load_preset
-from sglpr_jax.training.recipe import TrainResult
+from sglpr_jax.training.recipe import PackingStopped, TrainResult
 from sglpr_jax.training.recipe import train as train_network
 from sglpr_jax.training.run_folder import CONFIG_FILE
 from sglpr_jax.training.trainer import METRICS_FILE
@@ -143,9 +143,7 @@ def train(flags: Flags, stopped: Stopped) -> tuple[str, bool]:
             stopped=stopped,
             settings=settings,
         )
-    except KeyboardInterrupt:  # how `train` stops while it packs recordings
-        if not stopped():
-            raise
+    except PackingStopped:
         return f"recordings are packed in {flags.packs}", False
     path = flags.out / SUMMARY_FILE
     summary = read_json(path) if path.exists() else {}

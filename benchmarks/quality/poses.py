@@ -25,12 +25,12 @@ from sglpr_jax.data.gravity import mounted
 from sglpr_jax.data.mounting import upright_from_lidar
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import only
+from sglpr_jax.loops.acceptance import register_loops
 from sglpr_jax.loops.closure import LoopClosure, planar_loop, to_lidar
 from sglpr_jax.loops.keyframes import square_image
 from sglpr_jax.registration import bev_search
 from sglpr_jax.registration.bev_alignment import refine
 from sglpr_jax.registration.bev_spectra import match_spectra, query_spectra
-from sglpr_jax.registration.gicp import register
 from sglpr_jax.se3 import transform_covariance
 from sglpr_jax.sim.recording import SimulatedRecording
 from sglpr_jax.sim.sceneries import REPEATING
@@ -64,7 +64,7 @@ def pairs(
         drives: drives of the pairs.
         pairs: pairs of each drive.
         gravity: how gravity is found, as by `--gravity`. None: the true mounting.
-        registered: register the scans in 6 degrees of freedom (extra slam).
+        registered: register the scans in 6 degrees of freedom.
     """
     median, high = chi2.ppf([0.5, 0.95], 6 if registered else 3)
     columns = ("pairs", "aliases", f"median ({median:.2f})", f"95 % ({high:.2f})", "deviation, m", *ERRORS)
@@ -139,10 +139,9 @@ def _aligned(recording: Recording, pairs: np.ndarray) -> Iterator[LoopClosure]:
 
 
 def _registered(recording: Recording, loop: LoopClosure) -> LoopClosure:
-    """Loop with pose and covariance from registering the points of its scans."""
-    points = [recording.points(frame) for frame in (loop.query, loop.match)]
-    registration = register(*points, initial=loop.match_from_query, initial_covariance=loop.covariance)
-    return dataclasses.replace(loop, **registration._asdict())
+    """Loop with pose and covariance from registering the points of its scans, also if they overlap little."""
+    accepted, rejected = register_loops(recording, recording, [loop], should_stop=lambda: False)
+    return accepted[0] if accepted else rejected[0].loop
 
 
 def search(drives: tyro.conf.OmitArgPrefixes[Drives] = WALKS, *, weights: str = "sglpr") -> None:

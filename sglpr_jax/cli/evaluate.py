@@ -58,7 +58,7 @@ class EvaluateCommand:
     which its paper does not state), pairs-f1max and bevplace-recall-at-1."""
     compare: tuple[Path, ...] = ()
     """Files of other methods on the same frames, to compare with FILE. Without poses or times of their own, they use
-    those of FILE."""
+    those of FILE. If FILE has no times, it uses those of the first file that has them."""
     data: Path | None = None
     """Dataset with the scans or images of the frames, which the page then shows. --seq selects the sequence. If FILE
     does not name its sequence, --seq names it. Published splits depend on this name."""

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from sglpr_jax.cli.config_file import record_command
-from sglpr_jax.cli.recording import CloudOptions, DetectorFlags
+from sglpr_jax.cli.recording import CloudOptions, DetectorFlags, report_bad_scan
 from sglpr_jax.cli.runtime import print_error
-from sglpr_jax.files import exclusive_lock, in_short
+from sglpr_jax.files import exclusive_lock
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.stop_request import stop_on_signal
@@ -123,10 +123,6 @@ def run_node(
             say(f"{command.out}: {', '.join(path.name for path in paths)}")
         if cloud_scans is not None:
             recording, poses = cloud_scans.recording(command.sensor_height)
-
-            def report_bad_scan(scan: str, error: Exception) -> None:
-                report("cloud", f"scan {scan} is not in the cloud: {in_short(error, most=300)}")
-
             with contextlib.redirect_stdout(sys.stderr):  # standard output has the lines of the sink `json`
                 command.output.write([recording], [poses], on_bad_scan=report_bad_scan)
 

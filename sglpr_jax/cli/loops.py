@@ -164,7 +164,7 @@ def _search_and_write(command: LoopsCommand) -> int:
     """Find the loops, write all files of the command and print a summary. Returns the exit status."""
     from sglpr_jax.evaluation.loops_page import PAGE, loops_page
     from sglpr_jax.evaluation.rerun_file import write_rerun
-    from sglpr_jax.loops.checkpoint import delete_checkpoint
+    from sglpr_jax.loops.checkpoint import ODOMETRY_LOG, delete_checkpoint
     from sglpr_jax.loops.closure import why_rejected
     from sglpr_jax.loops.result import diagnose_no_loops
     from sglpr_jax.loops.search import find_loops
@@ -179,12 +179,12 @@ def _search_and_write(command: LoopsCommand) -> int:
         command.recordings,
         AUTO if command.odometry == AUTO else command.odometry_files,
         format=command.odometry_format,
-        checkpoint=lambda number: checkpoint / f"{number}" / "odometry.log",
+        checkpoint=lambda number: checkpoint / f"{number}" / ODOMETRY_LOG,
     )
     command.output.check_recordings(recordings)
     images = next((recording for recording in recordings if recording.has_images), None)
     if command.register and images is not None:
-        print(f"{images.name}: loops are not registered, because they are ready-made images", file=sys.stderr)
+        print(f"loops are not registered, because {images.name} has ready-made images", file=sys.stderr)
     title = recordings[0].name if len(recordings) == 1 else f"of {len(recordings)} recordings"
     # Each scan is compared within its recording, and then with every earlier recording.
     comparisons = sum((1 + number) * len(recording) for number, recording in enumerate(recordings))
@@ -194,7 +194,7 @@ def _search_and_write(command: LoopsCommand) -> int:
             params,
             odometry=odometry or None,
             config=detector,
-            registered=command.register and images is None,
+            registered=None if command.register else False,
             scale=effective.scale,
             on_bad_scan=report_bad_scan if command.skip_bad else None,
             kept_in=checkpoint,

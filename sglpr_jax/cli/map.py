@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 UNFINISHED = ".unfinished"
 """Suffix of the folder of a running command's checkpoint, beside the map."""
-ODOMETRY, ODOMETRY_CHECKPOINT = ".odometry.tum", ".odometry.log"
-"""Suffixes of the odometry of --poses auto and of its checkpoint, beside the map."""
+ODOMETRY = ".odometry.tum"
+"""Suffix of the odometry of --poses auto, beside the map."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,7 +110,7 @@ def _build_and_write(command: MapCommand, params: "Params") -> int:
     """Build the map and write it, unless a stopped run would replace a larger map. Returns the exit status."""
     import numpy as np  # slow imports, not needed for --help
 
-    from sglpr_jax.loops.checkpoint import delete_checkpoint
+    from sglpr_jax.loops.checkpoint import ODOMETRY_LOG, delete_checkpoint
     from sglpr_jax.maps.build import map_recording
     from sglpr_jax.maps.place_map import PlaceMap, place_names
     from sglpr_jax.models.weights import weights_hash
@@ -120,13 +120,13 @@ def _build_and_write(command: MapCommand, params: "Params") -> int:
     if command.add_to is not None:
         existing_map = PlaceMap.load(command.add_to, weights_hash=weights_hash(params))
     pose_files = AUTO if command.poses == AUTO else (command.poses,)
-    odometry_checkpoint = command.file.with_suffix(ODOMETRY_CHECKPOINT)
+    unfinished = command.file.with_suffix(UNFINISHED)
     effective, (recording,), (poses,) = open_with_odometry(
         command,
         (command.recording,),
         pose_files,
         format=command.pose_format,
-        checkpoint=lambda number: odometry_checkpoint,
+        checkpoint=lambda number: unfinished / ODOMETRY_LOG,
     )
     command.output.check_recordings([recording])
     if command.poses == AUTO:
@@ -135,7 +135,6 @@ def _build_and_write(command: MapCommand, params: "Params") -> int:
     if existing_map is not None:
         with naming(f"{command.add_to}"):
             existing_map.index.check(scale=effective.scale)
-    unfinished = command.file.with_suffix(UNFINISHED)
     with stop_on_signal() as stop, progress_bar(f"map {recording.name}", len(recording)) as show:
         new_map, scans, skipped = map_recording(
             recording,
@@ -172,7 +171,6 @@ def _build_and_write(command: MapCommand, params: "Params") -> int:
         [recording], [world_from_new @ poses], on_bad_scan=report_bad_scan if command.skip_bad else None
     )
     delete_checkpoint(unfinished)
-    odometry_checkpoint.unlink(missing_ok=True)
     return 0
 
 

@@ -18,7 +18,7 @@ from sglpr_jax.stop_request import StopRequest, stop_on_signal
 if TYPE_CHECKING:
     from sglpr_jax.methods.learned.method import LearnedMethod
     from sglpr_jax.training.peer_inputs import TrainingInputs
-    from sglpr_jax.training.peers import ScoreFn
+    from sglpr_jax.training.peers import HeldOutScore
 
 RATES = "rates"
 """Folder of the search of the learning rate, in the folder of the run."""
@@ -105,11 +105,11 @@ def _has_run(out: Path, *, resume: bool) -> bool:
     return has_run
 
 
-def _training_inputs(command: PeersCommand, method: "LearnedMethod") -> "tuple[TrainingInputs, ScoreFn | None]":
+def _training_inputs(command: PeersCommand, method: "LearnedMethod") -> "tuple[TrainingInputs, HeldOutScore | None]":
     """Prepare the training recordings. Also returns the score on the recordings of --held-out, or None without them."""
     from sglpr_jax.cli.datasets import all_recordings
     from sglpr_jax.training.peer_inputs import prepare_inputs
-    from sglpr_jax.training.peers import held_out_score
+    from sglpr_jax.training.peers import HeldOutScore
     from sglpr_jax.training.validation import require_revisits
 
     cache = command.cache or cache_folder() / "peers"
@@ -121,14 +121,14 @@ def _training_inputs(command: PeersCommand, method: "LearnedMethod") -> "tuple[T
     held_out = all_recordings(command.held_out, title="held out")
     require_revisits(held_out)
     held_out_inputs = prepare_inputs(method, held_out, cache, progress=progress_bar)
-    return prepare_inputs(method, recordings, cache, progress=progress_bar), held_out_score(method, held_out_inputs)
+    return prepare_inputs(method, recordings, cache, progress=progress_bar), HeldOutScore(method, held_out_inputs)
 
 
 def _learning_rate(
     command: PeersCommand,
     method: "LearnedMethod",
     data: "TrainingInputs",
-    score: "ScoreFn | None",
+    score: "HeldOutScore | None",
     out: Path,
     stopped: StopRequest,
 ) -> float:
@@ -144,4 +144,3 @@ def _learning_rate(
         return best_rate(method, data, score, out / RATES, seconds=command.search_seconds, seed=command.seed, **options)
     except Stopped:
         stopped.exit("stopped; continue with --resume")
-        raise

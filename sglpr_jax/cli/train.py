@@ -147,8 +147,7 @@ def _train(
                 settings=settings(command),
             )
         except PackingStopped as stop:
-            stopped.exit(f"{stop}; run the same command again")
-            raise
+            stopped.exit(f"{stop}; run the same command again to continue")
     if is_first_host():
         print(result, file=sys.stderr)
     exit_unless_finished(result, stopped, stop_advice="continue with --resume")
@@ -177,7 +176,7 @@ def open_recordings(command: TrainCommand) -> "tuple[Sequence[Recording], Sequen
     recordings, test = leave_one_out(roots, command.seq, train_seqs=command.train_seq, **options)
     for name in command.method:
         if name in HANDCRAFTED:
-            require_content(name, HANDCRAFTED[name].takes, test)
+            require_content(name, HANDCRAFTED[name].takes, test, every_label=True)
     also = [recording for folder in command.also for recording in all_recordings(folder, **options)]
     resolved = {root.resolve() for root in roots}
     if same := [folder for folder in command.also if folder.resolve() in resolved]:

@@ -86,14 +86,14 @@ def poses_at(
 def deskewed(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"]) -> Recording:
     """Return a recording whose scans are deskewed when they are read: the points of scan i are in the frame of pose i.
 
-    A scan without another scan within a second before or after it, or with invalid times of points, is not changed.
+    A scan without another scan within a second before or after it, or without valid times of points, is not changed.
 
     Arguments:
       recording: Recording of scans with times, whose points have times (`Scan.point_times`).
       world_from_lidar: Pose of the LiDAR at the time of each scan, from odometry or a map.
 
-    Raises ValueError if scans or points have no times, those of the points in the first scans are invalid, or the poses
-    do not fit the scans.
+    Raises ValueError if the scans have no times, none of the first scans is readable with valid times of points, or the
+    poses do not fit the scans.
 
     Example:
       recording = sglpr_jax.deskewed(recording, sglpr_jax.read_odometry("odometry.tum"))
@@ -107,8 +107,6 @@ def deskewed(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"])
     def read(row: int, label_path: Path | None) -> Scan:
         """Read and deskew a scan. The result has no times of points."""
         scan = recording.read_row(row, label_path)
-        if scan.time_field is None:
-            raise ValueError(f"{scan.name}: expected times of the points, found none")
         point_times = valid_point_times(scan)
         rows = _rows_near(times, row)
         points = scan.cloud
@@ -140,20 +138,18 @@ def has_point_times(recording: Recording) -> bool:
 
 
 def point_times_problem(recording: Recording) -> str:
-    """Describe why the motion within the scans cannot be removed: "no times of points". Empty if it can be.
+    """Describe why the motion within the scans cannot be removed: "no valid times of points". Empty if it can be.
 
     Scans need increasing times, and the points of one of the first `MOST_TRIED` scans need valid times.
     """
-    if recording.has_images or not len(recording):
-        return "no scans"
     if recording.times is None:
         return "no times of scans"
     try:
         _check_point_times(recording)
     except (ValueError, OSError):
-        return "no times of points"
+        return "no valid times of points"
     rows = np.flatnonzero(np.diff(recording.times) <= 0)
-    return f"no later time of scan {recording.ids[rows[0] + 1]} than of the scan before it" if rows.size else ""
+    return f"scan {recording.ids[rows[0] + 1]} is not later than the scan before it" if rows.size else ""
 
 
 def valid_point_times(scan: Scan) -> Float32[np.ndarray, " n"] | None:
@@ -172,10 +168,8 @@ def _check_point_times(recording: Recording) -> None:
         try:
             if recording.scan(row, labels=False).point_times is not None:
                 return
-            raise ValueError(
-                f"sequence {recording.name}: expected times of the points to remove the motion within scans, found none"
-            )
         except (ValueError, OSError) as error:
             first_error = first_error or error
-    if first_error is not None:
-        raise first_error
+    raise first_error or ValueError(
+        f"sequence {recording.name}: expected times of the points to remove the motion within scans, found none"
+    )

@@ -76,7 +76,7 @@ def require_content(method: str, takes: str, recording: Recording, *, every_labe
     With `every_label`, every scan must have labels. Otherwise one label file suffices.
     """
     if takes.endswith("points") and recording.has_images:
-        raise ValueError(f"{method} needs points, found only images in sequence {recording.name}; use polar-fft")
+        raise ValueError(f"{method} needs points, found only images in sequence {recording.name}")
     if not takes.startswith("labelled"):
         return
     if not recording.has_labels:

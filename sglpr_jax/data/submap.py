@@ -157,7 +157,7 @@ class _KeyframeWindow:
             step_m, turn_deg = _distance_and_angle(last_pose, pose)
             path_m = last_path_m + step_m
         while self._keyframes and path_m - self._keyframes[0][1] > self._length_m:
-            self._keyframes.popleft()  # for good: `path_m` decreases if the sensor returns to the last keyframe
+            self._keyframes.popleft()  # for good: a return to the last keyframe decreases `path_m`
         in_window = [row for row, _ in reversed(self._keyframes)]
         if step_m >= self._keyframe_m or turn_deg >= KEYFRAME_DEG:
             self._keyframes.append((frame, path_m))

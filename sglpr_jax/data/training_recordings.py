@@ -54,8 +54,8 @@ def _with_positions(root: Path, name: str, **options: Any) -> Recording:
     recording = open_recording(root, name, **options)
     if recording.positions is None:
         raise ValueError(
-            f"{root}: sequence {name} has no poses, which training and testing need; use a folder of sequences with "
-            "poses, or choose them (bin/train --train-seq)"
+            f"{root}: sequence {name} has no poses, which training and testing need; use a folder in which all "
+            "sequences have poses, or for --data of bin/train choose those with --seq and --train-seq"
         )
     return recording
 

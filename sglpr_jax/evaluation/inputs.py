@@ -48,7 +48,7 @@ def read_input(
       trajectory: Positions and times of the frames. If None, only those in the file are used.
       sequence: Name of the sequence, for files that do not contain it.
       distance: Name of the distance between the descriptors of a .npy file, L2 by default. A .npz file has its own.
-      fallback: Replaces `trajectory`, if this is None, for a .npz file without positions.
+      fallback: Used if `trajectory` is None and the .npz file has no positions. Ignored for other files.
 
     Raises ValueError, with the name of the file, if the file is invalid or does not fit the other arguments.
     """
@@ -77,7 +77,7 @@ def read_methods(
 ) -> dict[str, Input]:
     """Read the file of each method by `read_input`. Returns the inputs by method name: the file name without suffix.
 
-    Files without positions have those of the first file. Files without times have the first times in a file.
+    Files without positions use those of the first file. Files without times use those of the first file that has times.
 
     Arguments:
       paths: Files of the methods. If file names are equal, the whole path is the name of the method.
@@ -315,10 +315,10 @@ def _require_trajectory(path: Path, trajectory: Trajectory | None) -> Trajectory
 def check_agreement(first: Input, other: Input) -> None:
     """Raise ValueError if `other` has other frames, positions or times than `first`: scores are then not comparable.
 
-    The ids of a file are not compared if they are row numbers, as those of a .npy file.
+    The ids of a file are not compared if they are row numbers and no scan was skipped, as in a .npy file.
     """
     if isinstance(first, DescriptorFile) and isinstance(other, DescriptorFile) and first.ids != other.ids:
-        has_row_ids = any(file.ids == _row_ids(len(file)) for file in (first, other))
+        has_row_ids = any(file.ids == _row_ids(len(file)) and file.is_described.all() for file in (first, other))
         if len(first) != len(other) or not has_row_ids:
             pairs = itertools.zip_longest(first.ids, other.ids, fillvalue="none more")
             first_id, other_id = next((a, b) for a, b in pairs if a != b)

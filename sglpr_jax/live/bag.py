@@ -21,7 +21,7 @@ class BagSource:
     ):
         """Begin after the last scan whose name is in `map_names`."""
         self._root, self._recording, self._rate, self._report = root.resolve(), recording, options.rate, report
-        self._poses = None if options.odometry_topic is None else recording.world_from_lidar
+        self._poses = recording.world_from_lidar
         last_taken = max((row for row in range(len(recording)) if self._scan_name(row) in map_names), default=-1)
         self._rows = range(last_taken + 1, len(recording))
         self._latest: LatestScan[LiveFrame] = LatestScan()
@@ -88,7 +88,7 @@ def open_source(where: str, options: LiveOptions, report: Report, map_names: Col
     name = None if options.topic is None else options.topic.strip("/").replace("/", "_")
     if len(names) == 1 and name not in names:  # a single recording is not named by its topic
         name = None
-    pose_topic = options.odometry_topic or ""  # without odometry, scans without a pose are not dropped
+    pose_topic = options.odometry_topic or ""  # "" reads no poses, so that scans without a pose are kept
     recording = open_recording(
         root, name, pose_topic=pose_topic, sensor_height=options.sensor_height, gravity="recording"
     )

@@ -79,7 +79,8 @@ class LoopEdge(NamedTuple):
     latency_s: float
     """Time from the arrival of the latest scan to the loop, in seconds. A loop may belong to a scan before it."""
     odometry_frame: int = 0
-    """Number of the odometry frame of the latest scan. It changes when the odometry begins in a frame of its own."""
+    """Number of the odometry frame of the latest scan. It changes when the odometry begins in a frame of its own.
+    Without odometry, it is the number of the segment of the motion by the scans."""
 
 
 class LatestScan(Generic[T]):

@@ -27,10 +27,12 @@ POLL_S = 0.05
 COMPLETE_AFTER_S = 2.0
 """Age of a file, in seconds, from which it is complete without a second look."""
 MAX_POSE_WAIT_S = 1.0
-"""Maximum time that a scan waits for its pose, in seconds. It begins when the file was written and, as the date of the
-file may be wrong, ends at the latest this time after the scan was taken."""
+"""Maximum time that a scan waits for its pose, in seconds. It counts from the date of the file or, if that is in the
+future, from the time at which the scan was taken."""
 NEAR_POSES = 25
-"""Number of poses before and after a time that are searched for those to interpolate. Earlier poses are dropped."""
+"""Number of poses before and after a time that are searched for those to interpolate."""
+KEPT_POSES = 1000
+"""Number of poses before the last requested one that are kept, for scans that come out of order."""
 
 
 class FolderSource:
@@ -50,7 +52,7 @@ class FolderSource:
         """Format of .bin files whose names do not state it, detected in the content of the first one."""
         self._sizes: dict[Path, int] = {}  # size of each waiting file at the last look, in bytes
         self._waiting: list[Path] = []  # files that were not taken, in order
-        self._listed_change_ns = 0  # modification time of the folder when it was listed last, in nanoseconds
+        self._listed_change_ns = 0  # modification time of the folder at its last final listing, in nanoseconds
         self._closed = False
         self._taken = set[str]()  # names of the files
         paths = self._list()
@@ -85,15 +87,16 @@ class FolderSource:
         return list(in_natural_order(self._root / name for name in new_names))
 
     def _update_waiting(self) -> None:
-        """List the folder again if no file waits, and if it changed since the last time, or less than
-        `COMPLETE_AFTER_S` ago."""
+        """List the folder again if no file waits, until a listing is final: `COMPLETE_AFTER_S` after the last change,
+        so that no later file has the same time of change."""
         if self._waiting:
             return
         try:
             changed_ns = self._root.stat().st_mtime_ns
-            if changed_ns != self._listed_change_ns or time.time_ns() - changed_ns <= COMPLETE_AFTER_S * 1e9:
+            if changed_ns != self._listed_change_ns:
+                is_final = time.time_ns() - changed_ns > COMPLETE_AFTER_S * 1e9
                 self._waiting = self._list()
-                self._listed_change_ns = changed_ns
+                self._listed_change_ns = changed_ns if is_final else 0
         except OSError as error:
             self._report("folder", f"{self._root}: expected a folder of scans, found none ({error.strerror})")
 
@@ -142,9 +145,9 @@ class FolderSource:
         """Pose of a scan, or None if the file does not have it yet. An invalid line is reported."""
         try:
             poses.read_appended()
-            return poses.of(row, stamp, is_late=is_late)
-        except (ValueError, OSError) as error:
-            return self._report("poses", f"a pose is left out: {in_short(error, most=300)}")
+        except (ValueError, OSError) as error:  # of any line
+            self._report("poses", in_short(error, most=300))
+        return poses.of(row, stamp, is_late=is_late)
 
 
 def _scan_name(path: Path) -> str:
@@ -161,15 +164,15 @@ def _time_in_name(path: Path) -> float | None:
 
 
 def _check_not_removed(root: Path, missing: Collection[str], poses: "GrowingPoses") -> None:
-    """Raise ValueError if scans of the folder were removed, so that the numbers of others are not the lines of their
-    poses any more. `missing` has the names of the map that no file has."""
+    """Raise ValueError if scans of the folder were removed, because later scans would then get the poses of other
+    lines. `missing` has the names of the map that no file has."""
     folder = root.resolve()
-    paths = sorted(path for path in map(Path, missing) if path.parent == folder)
+    paths = sorted(path for path in map(Path, scan_names(missing)) if path.parent == folder)  # not those of a bag
     if by_line := [path.name for path in paths if not poses.has_time(_time_in_name(path))]:
         raise ValueError(
             f"{root}: expected all scans of the map, because the poses have a line for each, found {len(by_line)} "
-            f"removed ({in_short(', '.join(by_line))}); to remove scans, use poses as tum and names with times "
-            "(1690000000.25.pcd)"
+            f"removed ({in_short(', '.join(by_line))}); use another folder for new scans and poses, or poses as tum "
+            "and names with times (1690000000.25.pcd)"
         )
 
 
@@ -222,7 +225,7 @@ class GrowingPoses:
             row = self._drop_before(row - self._dropped)
             return self._poses[row] if 0 <= row < len(self._poses) else None
         first_later = self._drop_before(bisect.bisect_left(self._times, time))
-        near_lines = range(min(first_later + NEAR_POSES, len(self._poses)))
+        near_lines = range(max(first_later - NEAR_POSES, 0), min(first_later + NEAR_POSES, len(self._poses)))
         valid = [(self._times[i], pose) for i in near_lines if (pose := self._poses[i]) is not None]
         needed = time - (BEYOND_S if is_late else SAME_S)
         if len(valid) < 2 or valid[-1][0] < needed:  # the file does not reach the time yet
@@ -235,8 +238,8 @@ class GrowingPoses:
         return time is not None and self._format in ("auto", "tum")
 
     def _drop_before(self, index: int) -> int:
-        """Drop the poses more than `NEAR_POSES` before an index. Returns the index among the others."""
-        dropped = min(max(index - NEAR_POSES, 0), len(self._poses))
+        """Drop the poses more than `KEPT_POSES` before an index. Returns the index among the others."""
+        dropped = min(max(index - KEPT_POSES, 0), len(self._poses))
         del self._times[:dropped], self._poses[:dropped]
         self._dropped += dropped
         return index - dropped

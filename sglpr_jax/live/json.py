@@ -16,9 +16,9 @@ from sglpr_jax.live.options import LiveOptions
 class JsonLines:
     """Writes a line for each scan and each loop at once, into a file completely or not at all."""
 
-    def __init__(self, file: IO[str], *, begin: str = ""):
-        """Take a file that is open for appending, or standard output. `begin` is written before the first line."""
-        self._file, self._begin = file, begin
+    def __init__(self, file: IO[str]):
+        """Take a file that is open for appending, or standard output."""
+        self._file = file
         self._is_stored = file is not sys.stdout and file.seekable()  # not a pipe
 
     def frame(self, status: FrameStatus) -> None:
@@ -34,13 +34,12 @@ class JsonLines:
 
     def _write(self, kind: str, message: FrameStatus | LoopEdge) -> None:
         values = {name: _json_value(value) for name, value in message._asdict().items()}
-        line = self._begin + json.dumps({"type": kind, **values}) + "\n"
+        line = json.dumps({"type": kind, **values}) + "\n"
         if self._is_stored:
             descriptor = self._file.fileno()
             append_whole(descriptor, line.encode(), size=os.fstat(descriptor).st_size)
         else:
             print(line, end="", file=self._file, flush=True)
-        self._begin = ""
 
 
 def _json_value(value: Any) -> Any:
@@ -56,11 +55,14 @@ def open_sink(where: str, options: LiveOptions, report: Report) -> JsonLines:
         return JsonLines(sys.stdout)
     path = Path(where)
     with raising_write_error(path):
-        return JsonLines(path.open("a", encoding="utf-8"), begin="\n" if _ends_within_line(path) else "")
+        file = path.open("a", encoding="utf-8")
+        if _ends_within_line(path):
+            print(file=file, flush=True)
+        return JsonLines(file)
 
 
 def _ends_within_line(path: Path) -> bool:
-    """Whether a file ends without a line break, as after a full disk."""
+    """Return whether a file ends without a line break, as after a loss of power."""
     if not path.is_file() or not path.stat().st_size:
         return False
     with path.open("rb") as file:

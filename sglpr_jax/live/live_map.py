@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from sglpr_jax.data.choices import SensorHeight
 from sglpr_jax.data.poses import as_pose
-from sglpr_jax.files import append_whole, raising_write_error, text_bytes, write_bytes
+from sglpr_jax.files import append_whole, raising_write_error, write_bytes
 from sglpr_jax.frame_log import FrameLog
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.live.data_types import LiveFrame, LoopEdge, Report
@@ -123,7 +123,7 @@ class LiveMap:
 
     @property
     def nbytes(self) -> int:
-        """Number of bytes of detector, times, odometry and its correction. The memory of programs is not counted."""
+        """Number of bytes of detector, names, times, odometry and its correction, without the memory of programs."""
         parts = [self.detector, self._stamps, self._poses, *([] if self.trajectory is None else [self.trajectory])]
         return self._name_bytes + sum(part.nbytes for part in parts)
 
@@ -192,7 +192,7 @@ class LiveMap:
         missed = _missing(loops, written)
         if missed and written:
             self._report("log", f"{path}: {len(missed)} loops were added that the last process missed")
-        content = text_bytes(loop_lines(loops))
+        content = loop_lines(loops).encode()
         if not path.is_file() or path.read_bytes() != content:  # with an equal file, a full disk does not matter
             write_bytes(path, content)
         with raising_write_error(path):

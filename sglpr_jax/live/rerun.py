@@ -52,8 +52,8 @@ class RerunSink:
                     raise
 
     def loop(self, edge: LoopEdge) -> None:
-        """Write a loop as text, and draw a line between the positions of its scans. Lines in an earlier odometry frame
-        are cleared."""
+        """Write a loop as text, and draw a line between the positions of its scans. The first loop in a new odometry
+        frame deletes the lines in the earlier one."""
         self._set_time(edge.query, edge.query_time)
         text = f"query {edge.query}, match {edge.match}: probability {edge.probability:.4f}"
         self._stream.log("loops", rerun.TextLog(text))

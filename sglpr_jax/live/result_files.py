@@ -27,10 +27,10 @@ def write_results(live: LiveMap, folder: Path) -> list[Path]:
         scans = np.arange(len(odometry))
         segment_starts = np.flatnonzero(np.diff(detector.finder.segments_of(scans))) + 1  # where the motion is unknown
         segments = np.split(scans, segment_starts)
-        chains = [(frames, odometry[frames]) for frames in segments]
+        chains = [(frames, odometry[frames], detector.config.drift) for frames in segments]
     loops = live.loops
     rejected = [*detector.rejected, *detector.undecided()]
-    files = graph_files(loops, rejected, chains, drift=detector.config.drift)
+    files = graph_files(loops, rejected, chains)
     files[LOOPS_FILE] = partial(write_loops_jsonl, loops=loops)
     if len(odometry):
         files[TRAJECTORY] = partial(write_tum, poses=odometry, times=live.stamps)

@@ -189,7 +189,7 @@ class RosSink:
 
     def loop(self, edge: LoopEdge) -> None:
         """Publish an edge. Publish the lines of the latest loops, too, if both scans have odometry or if the odometry
-        frame has changed. Lines in an earlier odometry frame are deleted."""
+        frame has changed. The first loop in a new odometry frame deletes the lines in the earlier one."""
         self._publish_edge(edge_message(edge))
         query_pose, match_pose = edge.world_from_query, edge.world_from_match
         has_changed = edge.odometry_frame != self._odometry_frame

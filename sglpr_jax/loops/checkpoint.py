@@ -3,10 +3,11 @@
 All results that take time are stored: descriptors, images, and comparisons with other frames.
 """
 
+import contextlib
 import dataclasses
 import hashlib
 import json
-import shutil
+import os
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -32,7 +33,7 @@ from sglpr_jax.registration.bev_search import CorrelationPeak
 from sglpr_jax.schema import Column, check_about, check_columns
 
 FORMAT = "sglpr-jax unfinished loops 9"
-LOG = "checkpoint.log"
+LOG, ODOMETRY_LOG = "checkpoint.log", "odometry.log"
 OLD = "settings.json"
 """File of checkpoints of earlier versions, which are not read."""
 FRAME_FORMAT = "sglpr-jax live 6"
@@ -123,8 +124,13 @@ def settings(
 
 
 def delete_checkpoint(folder: Path) -> None:
-    """Delete the folder of a checkpoint, with everything in it. The folder must be the command's own."""
-    shutil.rmtree(folder)
+    """Delete the logs in the folder of a checkpoint and below, and the folders that are then empty."""
+    for parent, _, names in os.walk(folder, topdown=False):
+        for name in names:
+            if name.startswith((LOG, ODOMETRY_LOG)):  # also damaged ones, which are kept under longer names
+                Path(parent, name).unlink()
+        with contextlib.suppress(OSError):  # files of the user are in it
+            Path(parent).rmdir()
 
 
 def add_scans(

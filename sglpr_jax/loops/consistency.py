@@ -144,7 +144,7 @@ MAX_RIVAL = 0.5
 
 
 def accept_between(
-    loops: Sequence[LoopClosure], motion: BevOdometry, *, drift: DriftModel
+    loops: Sequence[LoopClosure], motion: BevOdometry, *, drift: DriftModel, known: int = 0
 ) -> tuple[list[list[LoopClosure]], list[RejectedClosure]]:
     """Accept sets of consistent loops between two sessions, at most one for each pair of their segments.
 
@@ -152,17 +152,20 @@ def accept_between(
       loops: Loops between gravity-aligned frames, rows of the motion, in the order of their queries.
       motion: Motion of both sessions (`BevOdometry.joined`). Relative poses are known only within its segments.
       drift: Drift model of the motion.
+      known: Number of first frames whose poses do not drift, such as those of a map.
 
     Returns:
       The accepted sets, the largest one first, and the rejected loops.
     """
     query, match = frames_of(loops)
     segments = np.stack([motion.segments[match], motion.segments[query]], axis=1)
+    drifting_m = motion.travelled.copy()
+    drifting_m[:known] = 0
     accepted, rejected = [], []
     for segment_pair in np.unique(segments, axis=0):
         members = [loops[row] for row in np.flatnonzero((segments == segment_pair).all(axis=1)).tolist()]
         all_rows = np.arange(len(members))
-        pairs = are_consistent(members, motion.path, travelled_m=motion.travelled, drift=drift)
+        pairs = are_consistent(members, motion.path, travelled_m=drifting_m, drift=drift)
         largest = largest_consistent_set(pairs).tolist()
         other_rows = np.setdiff1d(all_rows, largest)
         rival = largest_consistent_set(pairs[np.ix_(other_rows, other_rows)])

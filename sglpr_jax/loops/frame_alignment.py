@@ -51,7 +51,7 @@ class SegmentAlignment(NamedTuple):
     def __str__(self) -> str:
         (x, y, z), sigma = self.match_from_query[:3, 3], np.sqrt(np.diag(self.covariance))
         yaw, scans = np.degrees(yaw_of(self.match_from_query)), ""
-        if not self.match.is_odometry:
+        if not (self.match.is_odometry and self.query.is_odometry):
             scans = f" of scans {self.match.first}-{self.match.last} and {self.query.first}-{self.query.last}"
         return (
             f"transform{scans} x {x:.2f}, y {y:.2f}, z {z:.2f} m, yaw {yaw:.2f} degrees "

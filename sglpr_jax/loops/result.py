@@ -54,7 +54,7 @@ class LoopSearchResult:
     motion excludes."""
     transforms: tuple[SegmentAlignment, ...] = ()
     """Transforms between the frames of sessions: for each pair, one for each accepted pair of segments, that with most
-    loops first. With odometry there is at most one."""
+    loops first. If both sessions have odometry, there is at most one."""
     model: LoopModel | None = None
     """Model of the probabilities."""
     config: DetectorConfig = DetectorConfig()

@@ -257,17 +257,20 @@ def _search_session(
             raise ValueError(
                 f"{recording.name}: expected at least one scan that is not empty, found {len(finder)} empty ones"
             )
-    if odometry is not None and finder.scans == len(recording) and finder.odometry_check.is_unusable:
+    if odometry is not None and finder.odometry_check.is_unusable:
+        is_complete = finder.scans == len(recording)
+        fate = "is ignored" if is_complete else "will be ignored after the last scan"
         length, degrees = finder.odometry_check.errors  # per metre of the scaled drive
         warn(
-            f"{recording.name}: the odometry contradicts the motion between neighbouring scans and is ignored: it "
+            f"{recording.name}: the odometry contradicts the motion between neighbouring scans and {fate}: it "
             f"differs by {100 * length:.0f} % of the travelled distance and {100 * scale * degrees:.0f} degrees per "
             f"100 m; check that the poses belong to these scans and use these axes: {AXES}"
         )
-        new_detector = LoopDetector(finder.params, model=detector.model, config=config)
-        options = {"registered": registered, "scale": scale, **stream}
-        kept_in = None if kept_in is None else kept_in / "without-odometry"
-        return _search_session(recording, None, new_detector, kept_in=kept_in, **options)
+        if is_complete:
+            new_detector = LoopDetector(finder.params, model=detector.model, config=config)
+            options = {"registered": registered, "scale": scale, **stream}
+            kept_in = None if kept_in is None else kept_in / "without-odometry"
+            return _search_session(recording, None, new_detector, kept_in=kept_in, **options)
     loops, rejected = detector.loops, list[RejectedClosure]()
     drift = config.drift if odometry is None else finder.present_drift
     path = finder.motion.path

@@ -63,8 +63,7 @@ def align_maps(before: PlaceMap, new: PlaceMap) -> MapAlignment | None:
         upright = to_upright(loop, query=new.mounting(loop.query), match=before.mounting(loop.match))
         upright_loops.append(dataclasses.replace(upright, query=len(before) + loop.query))
     motion = BevOdometry.joined([BevOdometry.of(places.upright_poses()) for places in (before, new)])
-    motion.travelled[: len(before)] = _travelled_in_recordings(before)
-    groups, _ = accept_between(upright_loops, motion, drift=DriftModel())
+    groups, _ = accept_between(upright_loops, motion, drift=DriftModel(), known=len(before))
     if not groups:
         return None
     accepted_rows = {loop.query - len(before) for loop in groups[0]}
@@ -81,14 +80,6 @@ def align_maps(before: PlaceMap, new: PlaceMap) -> MapAlignment | None:
     new_poses = new.world_from_place[[loop.query for loop in accepted_loops]]
     apart_m = np.linalg.norm(located_poses[:, :3, 3] - new_poses[:, :3, 3], axis=1)
     return MapAlignment(old_from_new, covariance, len(accepted_loops), float(np.median(apart_m)))
-
-
-def _travelled_in_recordings(places: PlaceMap) -> Float[np.ndarray, " n"]:
-    """Travelled distance at each place since the first place of its recording, in metres. With the whole path through
-    all recordings, large drift would be assumed between places of two recordings at one position."""
-    recordings = np.array([place_id.rpartition("/")[0] for place_id in places.index.ids])
-    starts = np.flatnonzero(recordings[1:] != recordings[:-1]) + 1
-    return np.concatenate([travelled(poses) for poses in np.split(places.world_from_place, starts)])
 
 
 def check_one_frame(before: PlaceMap, new: PlaceMap) -> None:

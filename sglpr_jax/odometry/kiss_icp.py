@@ -217,7 +217,7 @@ def _poses_at_scan_times(
 def _check_registration(
     recording: Recording, points: Float[np.ndarray, " n"], overlap: Float[np.ndarray, " n"]
 ) -> None:
-    """Warn of scans with few points or little overlap. Raises ValueError if all scans have few or are unreadable.
+    """Warn of scans with few points or little overlap. Raises ValueError if no readable scan has enough points.
 
     `points` and `overlap` are those of `RESULT_NUMBERS`.
     """

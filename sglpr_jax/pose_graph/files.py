@@ -47,9 +47,8 @@ class Graph(NamedTuple):
 def write_g2o(
     path: Path | str,
     loops: Sequence[LoopClosure],
-    chains: Sequence[tuple[Int[np.ndarray, " _"], Float[np.ndarray, "_ 4 4"]]] = (),
+    chains: Sequence[tuple[Int[np.ndarray, " _"], Float[np.ndarray, "_ 4 4"], DriftModel]] = (),
     *,
-    drift: DriftModel | Sequence[DriftModel] = DriftModel(),
     comments: Sequence[str] = (),
 ) -> None:
     """Write a pose graph: a vertex for each pose, an edge for each step of the odometry, an edge for each loop.
@@ -57,20 +56,18 @@ def write_g2o(
     Arguments:
       path: File to write.
       loops: Loops. Their frames are vertices.
-      chains: Vertices and poses of the LiDAR for each session with odometry. Without them, only the loops are written.
-      drift: Drift of the odometry of all chains or of each one, which determines the information matrices of its edges
-        (`step_deviations`).
+      chains: Vertices, poses of the LiDAR and drift for each session with odometry. The drift determines the
+        information matrices of the edges (`step_deviations`). Without chains, only the loops are written.
       comments: Lines at the beginning of the file, which readers ignore.
 
     Raises WriteError if the file cannot be written.
     """
     lines = [f"# {comment}" for comment in comments]
-    drifts = [drift] * len(chains) if isinstance(drift, DriftModel) else drift
-    for (vertices, odometry), chain_drift in zip(chains, drifts, strict=True):  # of one session each
+    for vertices, odometry, drift in chains:
         lines += [f"{VERTEX} {i} {pose}" for i, pose in zip(vertices, _pose_texts(odometry), strict=True)]
         steps = _pose_texts(inverse(odometry[:-1]) @ odometry[1:])
         # metres and radians of each step, each three times: x, y, z, then rotations about x, y, z
-        variances = np.repeat(np.stack(step_deviations(odometry, chain_drift), axis=1), 3, axis=1) ** 2
+        variances = np.repeat(np.stack(step_deviations(odometry, drift), axis=1), 3, axis=1) ** 2
         for (i, j), step, variance in zip(itertools.pairwise(vertices), steps, variances, strict=True):
             lines.append(f"{EDGE} {i} {j} {step} {_rounded_text(np.diag(1 / variance)[UPPER_TRIANGLE])}")
     for loop, pose in zip(loops, _pose_texts([loop.match_from_query for loop in loops]), strict=True):

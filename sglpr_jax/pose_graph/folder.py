@@ -58,18 +58,18 @@ def write_loop_folder(
     """
     folder, names, numbers, placed = Path(folder), result.unique_names, vertex_numbers(result), placements(result)
     ids, recordings = dict[int, str](), dict[int, str]()  # by vertex number
-    chains, drifts = [], []  # vertex numbers and poses, and drift, of each session with odometry
+    chains = []  # vertex numbers, poses and drift of each session with odometry
     for name, vertices, (_, group_from_session), session in zip(names, numbers, placed, result.sessions, strict=True):
         ids |= zip(vertices.tolist(), session.recording.ids, strict=True)
         recordings |= dict.fromkeys(vertices.tolist(), name)
         if session.odometry is not None:
-            chains.append((vertices[: session.frames], group_from_session @ session.odometry[: session.frames]))
-            drifts.append(session.drift)
+            poses = group_from_session @ session.odometry[: session.frames]
+            chains.append((vertices[: session.frames], poses, session.drift))
     named: dict[str, Any] = {"ids": ids, "recordings": recordings if len(names) > 1 else None}
     loops = [renumbered(loop, numbers) for loop in result.loops]
     rejected = convert_rejected(result.rejected, lambda loop: renumbered(loop, numbers))
     comments = _comments(result, names, numbers) if len(names) > 1 else []
-    files = graph_files(loops, rejected, chains, drift=drifts, comments=comments, **named)
+    files = graph_files(loops, rejected, chains, comments=comments, **named)
     files[LOOPS_JSONL] = partial(write_loops_jsonl, loops=loops, **named)
     if len(names) > 1:
         files[FRAMES] = partial(write_json, value=_frames_json(result, names, numbers))
@@ -87,17 +87,16 @@ def write_loop_folder(
 def graph_files(
     loops: Sequence[LoopClosure],
     rejected: Sequence[RejectedClosure],
-    chains: Sequence[tuple[Int[np.ndarray, " _"], Float[np.ndarray, "_ 4 4"]]],
+    chains: Sequence[tuple[Int[np.ndarray, " _"], Float[np.ndarray, "_ 4 4"], DriftModel]],
     *,
-    drift: DriftModel | Sequence[DriftModel],
     comments: Sequence[str] = (),
     ids: Ids | None = None,
     recordings: Ids | None = None,
 ) -> Writers:
-    """Return writers of the graph (g2o), the table of loops (csv) and the rejected pairs (JSON lines). `chains`,
-    `drift` and `comments` are arguments of `write_g2o`, `ids` and `recordings` of `loop_lines`."""
+    """Return writers of the graph (g2o), the table of loops (csv) and the rejected pairs (JSON lines). `chains`
+    and `comments` are arguments of `write_g2o`, `ids` and `recordings` of `loop_lines`."""
     return {
-        LOOPS_G2O: partial(write_g2o, loops=loops, chains=chains, drift=drift, comments=comments),
+        LOOPS_G2O: partial(write_g2o, loops=loops, chains=chains, comments=comments),
         LOOPS_CSV: partial(write_loops_csv, loops=loops, recordings=recordings),
         REJECTED: partial(write_loops_jsonl, loops=rejected, ids=ids, recordings=recordings),
     }

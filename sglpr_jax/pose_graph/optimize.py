@@ -1,7 +1,7 @@
 """Correction of a trajectory by its loops: a pose graph, solved with gtsam (extra `gtsam`).
 
 Graduated non-convexity (Yang et al., RA-L 2020) ignores wrong loops, which would bend a least-squares solution. The
-result is compared with the stated drift of the odometry.
+result is compared with the drift of the odometry.
 """
 
 import itertools
@@ -45,10 +45,10 @@ class OptimizedTrajectory(NamedTuple):
     moved_rms_m: float = 0.0
     """Distance between corrected and given positions, maximum and root mean square, in metres."""
     deviation: float = 0.0
-    """Largest deviation of the corrected trajectory from the odometry, in sigmas of the stated drift (`deviations`),
+    """Largest deviation of the corrected trajectory from the odometry, in sigmas of the drift (`deviations`),
     over the paths between the two frames of an inlier and between consecutive frames of inliers."""
     drift: DriftModel = DriftModel()
-    """Stated drift."""
+    """Drift of the odometry. With several sessions, the largest value of each number."""
 
     def __str__(self) -> str:
         if not self.inliers.any():
@@ -61,7 +61,7 @@ class OptimizedTrajectory(NamedTuple):
 
 
 def optimize_trajectory(result: LoopSearchResult) -> OptimizedTrajectory:
-    """Correct the odometry of all sessions by their loops, within the stated drift.
+    """Correct the odometry of all sessions by their loops, within its drift.
 
     Warns if loops that are not registered, and so measure no heights, move heights by metres.
 
@@ -128,8 +128,7 @@ def _solve_group(
         match, query = (sessions[node.session].recording.mounting_of(node.frame) for node in loop.nodes)
         upright_loops.append(to_upright(loop, query=query, match=match))
     levelled = {k: level_from_first @ poses for k, poses in upright.items()}
-    drift = DriftModel.largest(*(sessions[k].drift for k in members))
-    solution = solve_pose_graph(levelled, upright_loops, drift)
+    solution = solve_pose_graph(levelled, upright_loops, {k: sessions[k].drift for k in members})
     session_poses = np.split(solution.poses, np.cumsum([len(poses) for poses in upright.values()])[:-1])
     if any(loop.overlap is None for loop in loops):
         for k, corrected in zip(members, session_poses, strict=True):
@@ -144,8 +143,7 @@ def _solve_group(
 def _warn_of_height_change(
     name: str, odometry: Float[np.ndarray, "n 4 4"], corrected: Float[np.ndarray, "n 4 4"]
 ) -> None:
-    """Warn if the correction moved a pose of a recording up or down, in a level frame, by more than
-    `MAX_HEIGHT_CHANGE_M`."""
+    """Warn if a height changed by more than `MAX_HEIGHT_CHANGE_M`. The poses are in a level frame."""
     height_change_m = np.abs(corrected - odometry)[:, 2, 3].max(initial=0)
     if height_change_m > MAX_HEIGHT_CHANGE_M:
         warn(
@@ -176,7 +174,9 @@ def placements(result: LoopSearchResult) -> tuple[tuple[int, Float[np.ndarray, "
 
 
 def solve_pose_graph(
-    odometry: Mapping[int, Float[np.ndarray, "_ 4 4"]], loops: Sequence[LoopClosure], drift: DriftModel = DriftModel()
+    odometry: Mapping[int, Float[np.ndarray, "_ 4 4"]],
+    loops: Sequence[LoopClosure],
+    drifts: Mapping[int, DriftModel] | None = None,
 ) -> OptimizedTrajectory:
     """Solve the pose graph of sessions in one gravity-aligned frame.
 
@@ -187,23 +187,25 @@ def solve_pose_graph(
     Arguments:
       odometry: Pose of the sensor at each frame, for each session. Consecutive frames are connected.
       loops: Loops between the gravity-aligned frames of these sessions.
-      drift: Stated drift of the odometry.
+      drifts: Drift of the odometry of each session; the default model if omitted.
 
     Raises ImportError if the extra `gtsam` is not installed.
     """
     gtsam_library()  # raises the ImportError even if there are no loops
+    drifts = drifts or dict.fromkeys(odometry, DriftModel())
+    drift = DriftModel.largest(*drifts.values())
     sessions = np.repeat(list(odometry), [len(poses) for poses in odometry.values()])  # of each pose
     poses = np.concatenate(list(odometry.values()))
     rows = {session: np.flatnonzero(sessions == session) for session in odometry}
     loops = [renumbered(loop, rows) for loop in loops]
-    is_used = _odometry_deviations(loops, poses, sessions, drift) <= drift.max_deviation
+    is_used = _odometry_deviations(loops, poses, sessions, drifts) <= drift.max_deviation
     for _ in range(ROUNDS):
         if not is_used.any():
             break
         used_rows = np.flatnonzero(is_used)
-        solved, is_inlier = _solve_with_gtsam(poses, [loops[i] for i in used_rows], sessions, drift)
+        solved, is_inlier = _solve_with_gtsam(poses, [loops[i] for i in used_rows], sessions, drifts)
         inlier_rows = used_rows[is_inlier]
-        loop_deviations = _deviations_at_loops(poses, solved, [loops[i] for i in inlier_rows], sessions, drift)
+        loop_deviations = _deviations_at_loops(poses, solved, [loops[i] for i in inlier_rows], sessions, drifts)
         if (loop_deviations <= drift.max_deviation).all():
             moved_m = np.linalg.norm(solved[:, :3, 3] - poses[:, :3, 3], axis=1)
             moved_rms_m = float(np.sqrt(np.mean(moved_m**2)))
@@ -218,16 +220,18 @@ def _solve_with_gtsam(
     odometry: Float[np.ndarray, "n 4 4"],
     loops: Sequence[LoopClosure],
     sessions: Int[np.ndarray, " n"],
-    drift: DriftModel,
+    drifts: Mapping[int, DriftModel],
 ) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " k"]]:
     """Solve a pose graph with gtsam. Returns the solved poses, and whether each loop is an inlier. `sessions` is the
     session of each pose. The motion between the last and the first pose of two sessions is unknown."""
     gtsam, graph = gtsam_library(), FactorGraph()
     for frame, pose in enumerate(odometry):
         graph.add_node(frame, pose, fixed=frame == 0)
-    metres, radians = step_deviations(odometry, drift)
     # Between sessions, a large value keeps the graph solvable even without loops.
-    metres, radians = (np.where(np.diff(sessions), UNKNOWN_MOTION_SIGMA, deviation) for deviation in (metres, radians))
+    metres, radians = np.full((2, len(odometry) - 1), UNKNOWN_MOTION_SIGMA)
+    for session, drift in drifts.items():
+        rows = np.flatnonzero(sessions == session)
+        metres[rows[:-1]], radians[rows[:-1]] = step_deviations(odometry[rows], drift)
     for frame, step in enumerate(inverse(odometry[:-1]) @ odometry[1:]):
         graph.add_step(frame, frame + 1, step, metres=metres[frame], radians=radians[frame])
     odometry_factors = graph.factors.size()  # number of the factors before those of the loops
@@ -247,11 +251,14 @@ def _odometry_deviations(
     loops: Sequence[LoopClosure],
     odometry: Float[np.ndarray, "n 4 4"],
     sessions: Int[np.ndarray, " n"],
-    drift: DriftModel,
+    drifts: Mapping[int, DriftModel],
 ) -> Float[np.ndarray, " k"]:
     """Return the deviation of each loop from the odometry, in standard deviations. 0 for loops between two sessions."""
-    query, match = frames_of(loops)
-    return np.where(sessions[query] == sessions[match], deviations(loops, DrivenPath(odometry), drift=drift), 0.0)
+    path, (query, match), result = DrivenPath(odometry), frames_of(loops), np.zeros(len(loops))
+    for session, drift in drifts.items():
+        rows = np.flatnonzero((sessions[query] == session) & (sessions[match] == session))
+        result[rows] = deviations([loops[row] for row in rows], path, drift=drift)
+    return result
 
 
 def _deviations_at_loops(
@@ -259,7 +266,7 @@ def _deviations_at_loops(
     poses: Float[np.ndarray, "n 4 4"],
     loops: Sequence[LoopClosure],
     sessions: Int[np.ndarray, " n"],
-    drift: DriftModel,
+    drifts: Mapping[int, DriftModel],
 ) -> Float[np.ndarray, " k"]:
     """Return the deviation of the solved poses from the odometry at each loop, in standard deviations. It is the
     largest one along the path between the two frames of the loop, and along the paths from each of them to the next
@@ -268,7 +275,7 @@ def _deviations_at_loops(
     ends = [(loop.match, loop.query) for loop in loops] + list(itertools.pairwise(frames))  # of each path
     # A solved path is written as a loop, to measure its deviation. Covariance and probability are not used.
     paths = [LoopClosure(int(b), int(a), inverse(poses[a]) @ poses[b], np.zeros((6, 6)), 1.0) for a, b in ends]
-    deviation = _odometry_deviations(paths, odometry, sessions, drift)
+    deviation = _odometry_deviations(paths, odometry, sessions, drifts)
     between_ends, to_next_frame = deviation[: len(loops)], deviation[len(loops) :]
     largest = []
     for loop, between in zip(loops, between_ends, strict=True):

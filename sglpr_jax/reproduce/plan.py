@@ -75,9 +75,9 @@ def _check_methods(reproduction: Reproduction) -> None:
             takes = content_of(name)
             try:
                 for seq in reproduction.seqs:
-                    require_content(name, takes, reproduction.recording(seq))
+                    require_content(name, takes, reproduction.recording(seq), every_label=True)
             except ValueError as error:
-                errors[name] = str(error).partition("; use ")[0]  # the advice below is for all methods
+                errors[name] = str(error)
         if errors:
             usable = " ".join([flag, *(name for name in names if name not in errors)])
             raise ValueError("; ".join([*errors.values(), f"use {usable}"]))

@@ -56,7 +56,7 @@ def embed(
       file.save(Path("08.npz"))
     """
     method = network(method) if isinstance(method, Params) else method
-    require_content(method.name, method.takes, recording)
+    require_content(method.name, method.takes, recording, every_label=on_bad_scan is None)
     check_value(batch, Size, "batch")
     batch = min(batch, 2 ** max(len(recording) - 1, 0).bit_length())  # the power of two for a short recording
     angles = None

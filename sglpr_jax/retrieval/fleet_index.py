@@ -121,11 +121,9 @@ class FleetIndex:
         if self.table is not None:
             return
         with storage_errors(self.address):
-            if TABLE not in self._connection.list_tables().tables:
-                return
             try:
                 table = self._connection.open_table(TABLE)
-            except ValueError as error:  # another process creates it: its folder is there before its first version
+            except ValueError as error:  # no process has created it, or its first version is not written yet
                 if "was not found" not in str(error):
                     raise
                 return

@@ -14,6 +14,7 @@ import optax
 from jax.sharding import AxisType, Mesh
 from jaxtyping import Array, Float, Float32, Int, Shaped
 
+from sglpr_jax.data.fingerprint import fingerprint
 from sglpr_jax.fields import CountOrZero, NotNegative, Positive, check_fields
 from sglpr_jax.files import read_json, write_json
 from sglpr_jax.methods.learned.method import LearnedMethod, Tuples, Variables
@@ -61,11 +62,14 @@ class RunSettings:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class ScoreFn:
-    """Scores weights of a method on held-out recordings, which have revisits."""
+class HeldOutScore:
+    """Score of a method's weights on held-out recordings. Raises ValueError if a recording has no revisits."""
 
     method: LearnedMethod
     held_out: TrainingInputs
+
+    def __post_init__(self):
+        require_revisits(self.held_out.recordings)
 
     def __call__(self, variables: Variables) -> dict[str, float]:
         """Return `recall_at_1 NAME` for each recording, and the mean `recall_at_1`, which selects the best weights."""
@@ -142,7 +146,7 @@ def train_learned(
     settings: RunSettings,
     out: Path,
     *,
-    score: ScoreFn | None = None,
+    score: HeldOutScore | None = None,
     resume: bool = False,
     stopped: Callable[[], bool] = lambda: False,
     report: Callable[[str], None] = lambda line: None,
@@ -176,7 +180,7 @@ def train_learned(
 
     recipe = dataclasses.asdict(method.recipe)
     del recipe["learning_rates"]  # the settings have the learning rate of this run
-    recordings = _names_and_sizes(data)
+    recordings = [{"name": recording.name, "scans": len(recording)} for recording in data.recordings]
     config = {"method": method.name, "settings": settings_json, "recipe": recipe, "recordings": recordings}
     lock = lock_run(out, config, seed=settings.seed, resume=resume, limits=LIMITS)
     with lock, progress(f"train {method.name}", math.ceil(settings.seconds)) as show:
@@ -252,17 +256,6 @@ def _peer_batches(network: PeerNetwork, data: TrainingInputs, pool: TuplePool, o
     return TupleBatches(data.recordings, pool, read, seed=network.seed, tuples=tuples, describe=describe, run=out)
 
 
-def _names_and_sizes(data: TrainingInputs) -> list[dict[str, Any]]:
-    """Return name and number of scans of each recording, for JSON."""
-    return [{"name": recording.name, "scans": len(recording)} for recording in data.recordings]
-
-
-def held_out_score(method: LearnedMethod, held_out: TrainingInputs) -> ScoreFn:
-    """Return the score of a method on held-out recordings. Raises ValueError if a recording has no revisits."""
-    require_revisits(held_out.recordings)
-    return ScoreFn(method, held_out)
-
-
 class Stopped(Exception):
     """The search was asked to stop. Its trainings can be resumed."""
 
@@ -270,7 +263,7 @@ class Stopped(Exception):
 def best_rate(
     method: LearnedMethod,
     data: TrainingInputs,
-    score: ScoreFn,
+    score: HeldOutScore,
     out: Path,
     *,
     seconds: float = 300.0,
@@ -281,8 +274,9 @@ def best_rate(
     """Train with each of the three learning rates of the method and return the one with the highest Recall@1.
 
     The folder `out` gets the trainings, of `seconds` each, and `rates.json` with all scores. Finished trainings are not
-    repeated. A rate whose loss is not finite has no score. If scores are equal, the smaller rate is returned.
-    `options` are those of `train_learned`. Raises FloatingPointError if no loss is finite, and `Stopped` after a stop.
+    repeated; they are scored again after more steps or on other held-out recordings. A rate whose loss is not finite
+    has no score. If scores are equal, the smaller rate is returned. `options` are those of `train_learned`. Raises
+    FloatingPointError if no loss is finite, and `Stopped` after a stop.
     """
     recalls: dict[float, float | None] = {}
     for rate in method.recipe.learning_rates:
@@ -292,7 +286,8 @@ def best_rate(
             run = train_learned(method, data, settings, folder, resume=resume, report=report, **options)
             if run.seconds < seconds:
                 raise Stopped
-            scored = {"step": int(run.state.step), "held_out": _names_and_sizes(score.held_out)}
+            held_out = [fingerprint(recording) for recording in score.held_out.recordings]
+            scored = {"step": int(run.state.step), "held_out": held_out}
             scores = read_json(score_file) if score_file.is_file() else {}
             if scores.get("scored") != scored:  # other steps or recordings, or none yet
                 scores = {"scored": scored, **score(variables_of(run.state))}

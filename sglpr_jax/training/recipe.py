@@ -88,7 +88,8 @@ def train(
 
     Args:
         config: Model, loss, optimiser, number of steps and all other settings, for example `preset("sglpr")`.
-        recordings: Training recordings. They need positions, and labels if the model or the loss uses them.
+        recordings: Training recordings. They need positions, and labels if the place head reads them. Without labels, a
+            segmentation head keeps its initial weights.
         out: Folder of the run: settings, metrics, checkpoints and the final weights.
         test: Recording of the later test. It is not read; the function only checks that it is not trained on.
         also: Recordings of a second dataset, which provide `config.also_tuples` tuples of each step.
@@ -146,7 +147,7 @@ def train(
         if config.model.segments and not _have_labels((*recordings, *also)):
             warn(
                 f"expected labels for the segmentation head, found none in {len(recordings) + len(also)} recording(s): "
-                "the head stays untrained; --model.categories 0 omits it"
+                "the head keeps its initial weights; model.categories 0 omits it"
             )
         options = {"start_from": start_from, "resume": resume, "callback": host_callback, "stopped": stopped}
         state = run_network(config, source, folder, score=score, **options).state
@@ -254,8 +255,10 @@ def _require_usable_also(config: TrainConfig, recordings: Sequence[Recording], a
     names = {recording.world: recording.name for recording in recordings if recording.world}
     shared = next((recording for recording in also if recording.world in names), None)
     if shared is not None and config.also_triplets and config.share_negatives:
-        found = f"{names[shared.world]} in --data and {shared.name} in --also"
-        raise ValueError(f"expected recordings of one world in --data, found world {shared.world} of {found}")
+        raise ValueError(
+            "share_negatives makes the places of --also negatives of --data: expected no common world, found one of "
+            f"{names[shared.world]} in --data and {shared.name} in --also; move both to --data"
+        )
 
 
 def _have_labels(recordings: Sequence[Recording]) -> bool:
@@ -304,10 +307,9 @@ def with_kept_descriptors(config: TrainConfig, weights: Params | Path | str | No
     given = (weights if isinstance(weights, Params) else load(weights)).config
     model = dataclasses.replace(config.model, descriptors_of=given.descriptors_of)
     same_head = dataclasses.replace(given, categories=model.categories, detail=model.detail)
-    if different := different_fields(same_head, model):
-        fields = ", ".join(f"model.{name} {value}" for name, (value, _) in different.items())
-        found = ", ".join(str(value) for _, value in different.values())
-        raise ValueError(f"{expected} {fields}, as in the weights, found {found}")
+    for name, (value, found) in different_fields(same_head, model).items():
+        if name != "backbone.drop_path":  # acts in training only
+            raise ValueError(f"{expected} model.{name} {value}, as in the weights, found {found}")
     return dataclasses.replace(config, model=model)
 
 

@@ -73,8 +73,10 @@ class TuplePool:
         self.separated = np.column_stack([self.positions[:, :2], WORLDS_APART_M * self.world_of])
         """Coordinates (n, 3) in metres: horizontal position, and one that puts worlds `WORLDS_APART_M` apart."""
         pairs = close_pairs(self.separated, closer_than_m=config.positive_m)
+        self.visit_end = visit_ends(pairs, self.recording_of, self.frame_of, gap=config.revisit_gap)
+        """Last place of the visit that each place belongs to (`visit_ends`)."""
         pairs = np.concatenate([pairs, pairs[:, ::-1]])  # (anchor, positive), in both orders
-        same_visit = self.are_of_one_visit(pairs[:, 0], pairs[:, 1], gap=config.revisit_gap)
+        same_visit = self.are_of_one_visit(*pairs.T)
         self.neighbours = self._positives_by_anchor(pairs[same_visit])
         self.revisits = self._positives_by_anchor(pairs[~same_visit])
         if not len(pairs):
@@ -152,9 +154,9 @@ class TuplePool:
         """Return whether places a and b are in different worlds or farther apart than the negative distance."""
         return ~self._are_within(a, b, self.config.negative_m)
 
-    def are_of_one_visit(self, a: Int[np.ndarray, "..."], b: Int[np.ndarray, "..."], *, gap: int) -> np.ndarray:
-        """Return whether places a and b are in one recording and at most `gap` frames apart."""
-        return (self.recording_of[a] == self.recording_of[b]) & (np.abs(self.frame_of[a] - self.frame_of[b]) <= gap)
+    def are_of_one_visit(self, a: Int[np.ndarray, "..."], b: Int[np.ndarray, "..."]) -> np.ndarray:
+        """Return whether the later of places a and b is in the visit of the earlier one."""
+        return np.maximum(a, b) <= self.visit_end[np.minimum(a, b)]
 
     def distances_from_anchors(self, places: Int[np.ndarray, "t k"]) -> Float[np.ndarray, "t k"]:
         """Return the horizontal distance of each place from its anchor, in metres. Infinite between worlds."""
@@ -173,6 +175,32 @@ class TuplePool:
         """Group pairs (anchor, positive) by anchor."""
         pairs = pairs[np.lexsort(pairs.T[::-1])]  # by anchor, then by positive
         return Positives(pairs[:, 1], np.searchsorted(pairs[:, 0], np.arange(len(self) + 1)))
+
+
+def visit_ends(
+    pairs: Int[np.ndarray, "pairs 2"],
+    recording_of: Int[np.ndarray, "n"],
+    frame_of: Int[np.ndarray, "n"],
+    *,
+    gap: int,
+) -> Int[np.ndarray, "n"]:
+    """Return the last place of the visit at each place: `gap` frames later or, if the sensor is still there, when it
+    leaves. A vehicle at a traffic light does not visit the place again and again.
+
+    Arguments:
+      pairs: All pairs of places within the positive distance, the earlier place first.
+      recording_of: Recording of each place, in order.
+      frame_of: Frame of each place, in order within its recording.
+      gap: Minimum length of a visit, in frames.
+    """
+    pairs = pairs[np.lexsort(pairs.T[::-1])]
+    first, later = pairs.T
+    rank = np.arange(len(pairs)) - np.searchsorted(first, first) + 1  # 1 for the next place that is near the first one
+    is_stay = frame_of[later] - frame_of[first] == rank  # all frames between are near, too
+    is_stay &= recording_of[first] == recording_of[later]
+    stay_end = np.arange(len(frame_of)) + np.bincount(first[is_stay], minlength=len(frame_of))
+    clock = recording_of * (frame_of.max(initial=0) + gap + 1) + frame_of
+    return np.maximum(stay_end, np.searchsorted(clock, clock + gap, side="right") - 1)
 
 
 def _first_unless_empty(preferred: Int[np.ndarray, "_"], fallback: Int[np.ndarray, "_"]) -> Int[np.ndarray, "_"]:
@@ -246,8 +274,8 @@ def _stretch(
     if stretch_length == 0:
         return plane[:0]
     pairs = close_pairs(plane, closer_than_m=sampling.positive_m)
-    revisits = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > sampling.revisit_gap]
-    is_revisiting = np.isin(frames, revisits)
+    ends = visit_ends(pairs, np.zeros_like(frames), frames, gap=sampling.revisit_gap)
+    is_revisiting = np.isin(frames, pairs[pairs[:, 1] > ends[pairs[:, 0]]])
     revisiting_by_start = np.convolve(is_revisiting, np.ones(stretch_length), mode="valid")
     start = int(np.abs(revisiting_by_start - config.share * is_revisiting.sum()).argmin())
     return plane[start : start + stretch_length]

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float32, Int
+from jaxtyping import Array, Bool, Float, Float32, Int
 from scipy.spatial.distance import cdist
 
 from sglpr_jax.data.recording import Recording
@@ -74,28 +74,31 @@ def validation_score(
 
     def score(params: Params) -> dict[str, float]:
         descriptors = describe_places(params, recordings, pool, np.arange(len(pool)), angles, config)
-        neighbours, _ = recall_and_f1_max(descriptors, pool, gap=0)
+        places = np.arange(len(pool))
+        neighbours, _ = recall_and_f1_max(descriptors, pool, np.eye(len(pool), dtype=bool))
         if not len(pool.revisits.anchors):
             return {"score": neighbours, "recall_neighbours": neighbours}
-        revisits, f1_max = recall_and_f1_max(descriptors, pool, gap=config.sampling.revisit_gap)
+        same_visit = pool.are_of_one_visit(places[:, None], places[None])
+        revisits, f1_max = recall_and_f1_max(descriptors, pool, same_visit)
         score = (revisits + f1_max) / 2
         return {"score": score, "recall_neighbours": neighbours, "recall_revisits": revisits, "f1max": f1_max}
 
     return score
 
 
-def recall_and_f1_max(descriptors: Float32[np.ndarray, "n d"], pool: TuplePool, *, gap: int) -> tuple[float, float]:
+def recall_and_f1_max(
+    descriptors: Float32[np.ndarray, "n d"], pool: TuplePool, excluded: Bool[np.ndarray, "n n"]
+) -> tuple[float, float]:
     """Return Recall@1 and top-1 F1max. Every place of the pool is a query, and `descriptors` are those of its places.
 
-    The database of a query has all places of other recordings, and those of its own more than `gap` frames away. A
-    match is in the same world and within the positive distance. Recall@1 counts queries with a match; there must be
-    at least one. F1max accepts the nearest place up to a threshold on the descriptor distance: a match is right, a
-    place beyond the negative distance is wrong.
+    The database of a query has all places that its row in `excluded` does not exclude. A match is in the same world and
+    within the positive distance. Recall@1 counts queries with a match; there must be at least one. F1max accepts the
+    nearest place up to a threshold on the descriptor distance: a match is right, a place beyond the negative distance
+    is wrong.
     """
     queries = np.arange(len(pool))
-    same_visit = pool.are_of_one_visit(queries[:, None], queries[None], gap=gap)
-    is_match = ~same_visit & (cdist(pool.separated, pool.separated) < pool.config.positive_m)  # (query, place)
-    descriptor_distance = np.where(same_visit, np.inf, cdist(descriptors, descriptors))
+    is_match = ~excluded & (cdist(pool.separated, pool.separated) < pool.config.positive_m)  # (query, place)
+    descriptor_distance = np.where(excluded, np.inf, cdist(descriptors, descriptors))
     nearest = descriptor_distance.argmin(1)
     nearest_is_match = is_match[queries, nearest]
     has_match = np.asarray(is_match.any(1))

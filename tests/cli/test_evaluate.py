@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sglpr_jax.cli.evaluate import _default_folder
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 from .conftest import assert_one_line_error
@@ -92,16 +93,14 @@ def test_a_top_k_list_and_scored_pairs(score, command, laps, tmp_path):
     assert listed["score"] == pytest.approx(400 / 401)
 
 
-def test_results_are_written_into_no_folder_of_scans(command, laps, tmp_path):
-    run = ("evaluate", shutil.copy(laps / "08.npz", tmp_path), "--protocol", "bevplace-recall-at-1")
-    (tmp_path / "08").mkdir()
-    (tmp_path / "08" / "results.json").touch()
-    assert command(*run).status == 0
-    assert [path.name for path in (tmp_path / "08").iterdir()] == ["results.json"]
-    shutil.rmtree(tmp_path / "08")
-    (tmp_path / "08-results").rename(tmp_path / "08")  # a folder of results is written again
-    assert command(*run).status == 0
-    assert {path.name for path in tmp_path.iterdir()} == {"08.npz", "08"}
+def test_the_default_folder_is_no_folder_of_scans(tmp_path):
+    file, folder, other = tmp_path / "08.npz", tmp_path / "08", tmp_path / "08-results"
+    assert _default_folder(file) == folder
+    folder.mkdir()
+    (folder / "results.json").touch()
+    assert _default_folder(file) == _default_folder(folder) == other  # also for a file without a suffix
+    (folder / "report.html").touch()
+    assert _default_folder(file) == folder  # results are written again
 
 
 def test_methods_are_compared_on_one_page(score, laps):

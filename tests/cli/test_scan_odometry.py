@@ -48,7 +48,7 @@ def test_loops_of_scans_alone_end_with_a_trajectory(command, run, tmp_path):
     flags = ("--odometry", "auto", "--optimize", "--scan-odometry.max-range-m", "80", "--out", out)
     ended = command("loops", *run, *flags)
     assert ended.status == 0, ended.error
-    assert "points up to 80 m, voxels of 0.8 m, motion within scans not removed: no times of " in ended.error
+    assert "points up to 80 m, voxels of 0.8 m, motion within scans not removed: no valid times of " in ended.error
     poses = read_tum(out / "trajectory.tum")[0]
     np.testing.assert_allclose(read_tum(out / "trajectory-optimized.tum")[0], poses, atol=1e-6)
     assert poses.shape == (SCANS, 4, 4) and np.linalg.norm(poses[-1, :3, 3]) > 10

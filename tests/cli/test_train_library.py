@@ -35,7 +35,7 @@ def test_a_training_is_one_call(images, preset, tmp_path):
 
     out = tmp_path / "run"
     stops = iter([False, True])
-    with pytest.warns(DataWarning, match="found none in 1 recording.*the head stays untrained"):
+    with pytest.warns(DataWarning, match="found none in 1 recording.*the head keeps its initial weights"):
         stopped = train(config, recordings, out=out, callback=Noting(), stopped=lambda: next(stops))
     assert (stopped.steps, stopped.finished) == (2, False) and told == [2, "end 2", "closed"]
     with pytest.raises(FileExistsError, match="there is a run already"):
@@ -100,6 +100,6 @@ def test_recordings_that_cannot_be_trained_on_are_refused_before_the_run(
         train(mixed, [labelled], out=tmp_path / "run", also=[recording])
     mixed = dataclasses.replace(mixed, also_triplets=True, share_negatives=True)
     first, second = (dataclasses.replace(labelled, name=name, world="town") for name in ("first", "second"))
-    with pytest.raises(ValueError, match="found world town of first in --data and second in --also"):
+    with pytest.raises(ValueError, match="found one of first in --data and second in --also"):
         train(mixed, [first], out=tmp_path / "run", also=[second])
     assert not list(tmp_path.iterdir())

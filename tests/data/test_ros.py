@@ -281,7 +281,6 @@ def stamps(header_s: np.ndarray, delay_s: float) -> Stamps:
     ("delay_s", "ahead_s", "phase_s", "used"),
     [
         (0.2, 37.0, 0.01, "recorder"),  # the LiDAR has the clock of PTP
-        (0.2, -18.0, 0.01, "recorder"),
         (4.0, 0.0, 0.01, "header"),
         (8.0, 0.0, 0.0, "header"),  # slow SLAM, with the times of the scans
         (900.0, 0.0, 0.01, "header"),  # another pass
@@ -291,14 +290,13 @@ def test_two_clocks_are_found_by_the_times_of_the_recorder(delay_s, ahead_s, pha
     times = 1.7e9 + np.arange(0.0, 200.0, 0.5)
     scans = Stamps(stamps(times, 0.1).recorder_ns, times + ahead_s)
     poses = stamps(times + phase_s, delay_s)
+    *found, problem = times_on_one_clock(poses, scans)
     if used == "recorder":
-        expected = poses.recorder_s, scans.recorder_s
-        with pytest.warns(DataWarning, match=rf"a\.bag: .* 0\.2 s after .* scans {0.1 - ahead_s:.1f} s after theirs"):
-            found = times_on_one_clock(poses, scans, source="a.bag")
+        np.testing.assert_array_equal(found, (poses.recorder_s, scans.recorder_s))
+        assert "recorded 0.2 s after their header time, and scans -36.9 s after theirs" in problem
     else:
-        expected = poses.header_s, scans.header_s
-        found = times_on_one_clock(poses, scans, source="a.bag")
-    np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(found, (poses.header_s, scans.header_s))
+        assert not problem
 
 
 def test_poses_of_a_lidar_on_another_clock_are_those_at_its_scans(tmp_path):
@@ -312,13 +310,13 @@ def test_poses_of_a_lidar_on_another_clock_are_those_at_its_scans(tmp_path):
 
 
 def test_few_messages_may_come_late_but_a_clock_may_not_be_set_back():
-    times = 100 + np.arange(400) / 20
-    scans, one_late = stamps(times, 0.3), times[np.r_[:50, 51:56, 50, 56:400]]
+    times = 100 + np.arange(4000) / 20
+    scans, one_late = stamps(times, 0.3), times[np.r_[:50, 51:56, 50, 56:4000]]
     assert not Stamps(scans.recorder_ns, one_late).headers_are_valid()
-    found = times_on_one_clock(Stamps(scans.recorder_ns, one_late), scans, source="a.bag")
+    *found, _ = times_on_one_clock(Stamps(scans.recorder_ns, one_late), scans)
     np.testing.assert_array_equal(found, (one_late, times))
     set_back = np.where(times < 110, times, times - 1)
-    found = times_on_one_clock(Stamps(scans.recorder_ns, set_back), scans, source="a.bag")
+    *found, _ = times_on_one_clock(Stamps(scans.recorder_ns, set_back), scans)
     np.testing.assert_array_equal(found, (scans.recorder_s, scans.recorder_s))
 
 

@@ -64,7 +64,7 @@ def test_python_runs(page, in_examples, monkeypatch):
 
     Loops of `find_loops` are not registered, drives are short, and what is trained is a tiny model.
     """
-    short_drive = functools.partial(sglpr_jax.simulate_recording, scans=30)
+    short_drive = functools.partial(sglpr_jax.simulate_recording, scans=80)
     monkeypatch.setattr(sglpr_jax, "simulate_recording", short_drive)
     model, load, preset, find = model_preset("tiny"), sglpr_jax.load, sglpr_jax.preset, sglpr_jax.find_loops
     monkeypatch.setattr(sglpr_jax, "load", lambda name: load("sglpr-small"))

@@ -180,3 +180,5 @@ def test_row_numbers_as_ids_fit_any_ids_of_as_many_frames(make_file):
     check_agreement(rows, named)
     with pytest.raises(ValueError, match="the first file, 3 with '1328', found 2 with '000000'"):
         check_agreement(named, rows.only(np.array([True, True, False])))
+    with pytest.raises(ValueError, match="the first file, 2 with '000000', found 2 with '000001'"):
+        check_agreement(*(rows.only(np.array(kept)) for kept in ([True, True, False], [False, True, True])))

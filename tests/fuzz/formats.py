@@ -31,6 +31,7 @@ from sglpr_jax.models.backbone_config import SwinConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig, config_from_dict
 from sglpr_jax.models.sglpr import weight_shapes
 from sglpr_jax.models.weights_file import CONFIG_FILE, VALUES_HASH, WEIGHTS_FILE, load
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.pose_graph import files as loop_files
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.index import Index
@@ -252,7 +253,7 @@ FORMATS = {
     "map": Format("a.safetensors", written(MAP.save, "a.safetensors"), PlaceMap.load),
     "g2o": Format(
         "a.g2o",
-        written(lambda path: loop_files.write_g2o(path, LOOPS, [(np.arange(N), POSES)]), "a.g2o"),
+        written(lambda path: loop_files.write_g2o(path, LOOPS, [(np.arange(N), POSES, DriftModel())]), "a.g2o"),
         loop_files.read_g2o,
     ),
     "loops .jsonl": Format(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.live import folder
-from sglpr_jax.live.folder import NEAR_POSES, FolderSource, GrowingPoses
+from sglpr_jax.live.folder import FolderSource, GrowingPoses
 from sglpr_jax.live.options import LiveOptions
 from sglpr_jax.live.sources_and_sinks import open_source
 from sglpr_jax.pose_graph.files import write_tum
@@ -84,8 +84,14 @@ def test_the_folder_is_not_listed_again_while_scans_wait(incoming, said, monkeyp
     source, listings, list_folder = open_source(f"folder:{incoming}", LiveOptions(), said), [], FolderSource._list
     monkeypatch.setattr(FolderSource, "_list", lambda self: listings.append(list_folder(self)) or listings[-1][:])
     assert len(taken(source, 5)) == 5 and len(listings) == 1
+    monkeypatch.setattr(folder, "COMPLETE_AFTER_S", 1.0)
     scan(incoming / "5.bin")
+    changed_ns = incoming.stat().st_mtime_ns
     assert len(taken(source, 1)) == 1 and [path.name for path in listings[-1]] == ["5.bin"]
+    scan(incoming / "6.bin")
+    os.utime(incoming, ns=(changed_ns, changed_ns))  # as on a disk whose times are coarse
+    time.sleep(1.1)
+    assert len(taken(source, 1)) == 1
 
 
 def test_a_scan_that_cannot_be_read_is_reported_and_the_others_come(incoming, said):
@@ -103,12 +109,15 @@ def test_a_scan_that_cannot_be_read_is_reported_and_the_others_come(incoming, sa
 def test_poses_of_a_folder_are_those_of_their_line_or_time(incoming, tmp_path, said):
     poses = np.stack([transform(float(i), 0.0, 0.1 * i) for i in range(4)])
     write_tum(tmp_path / "poses.tum", poses, STAMP + np.arange(4.0))
+    with (tmp_path / "poses.tum").open("a") as file:
+        print("broken", file=file)  # costs no scan its pose
     for i in (0.5, 2.0):
-        scan(incoming / f"{STAMP + i}.bin")
+        os.utime(scan(incoming / f"{STAMP + i}.bin"), (STAMP, STAMP))
     options = LiveOptions(poses=tmp_path / "poses.tum")
     first, second = taken(open_source(f"folder:{incoming}", options, said), 2)
     np.testing.assert_allclose(first.odometry, transform(0.5, 0.0, 0.05), atol=1e-6)
     np.testing.assert_allclose(second.odometry, poses[2], atol=1e-6)
+    assert said.kinds == ["poses"]
 
 
 def test_a_scan_waits_for_a_pose_at_its_time_and_takes_the_last_one_only_if_it_is_late(tmp_path):
@@ -130,13 +139,15 @@ def test_a_scan_whose_file_has_a_date_in_the_future_does_not_wait_longer(incomin
     assert [frame.odometry for frame in taken(source, 1, 5.0)] == [None]
 
 
-def test_old_poses_are_dropped_and_a_file_that_begins_anew_is_read_from_its_beginning(tmp_path):
+def test_old_poses_are_dropped_and_a_file_that_begins_anew_is_read_from_its_beginning(tmp_path, monkeypatch):
+    monkeypatch.setattr(folder, "KEPT_POSES", 50)
     path = tmp_path / "poses.tum"
     found, poses = GrowingPoses(path, "tum", "auto"), np.stack([transform(float(i), 0.0, 0.0) for i in range(200)])
     write_tum(path, poses, STAMP + np.arange(200.0))
     found.read_appended()
     assert found.of(100, None)[0, 3] == 100 and found.of(101, None)[0, 3] == 101
-    assert found.of(0, STAMP + 198)[0, 3] == pytest.approx(198, abs=1e-3) and len(found._poses) == NEAR_POSES + 2
+    assert found.of(0, STAMP + 198)[0, 3] == pytest.approx(198, abs=1e-3) and len(found._poses) == 52
+    assert found.of(0, STAMP + 180.5)[0, 3] == pytest.approx(180.5, abs=1e-3)  # of a scan that comes out of order
     write_tum(path, poses[:3], STAMP + np.arange(3.0))
     with pytest.raises(ValueError, match=r"poses.tum: expected a file that grows, found one that begins anew"):
         found.read_appended()

@@ -107,7 +107,8 @@ def test_a_search_without_the_odometry_goes_on_too_and_begins_after_the_last_sca
     monkeypatch.setattr(OdometryCheck, "errors", (0.5, 0.02))
     recording, scans, done = only(twice[0], range(5)), 5, []
     options = {"odometry": twice[1][:scans], "registered": False, "config": CONFIG, "kept_in": tmp_path / "kept"}
-    (session,) = find_loops(recording, params, **options, should_stop=stopping_after(2, [])).sessions
+    with pytest.warns(DataWarning, match="contradicts the motion .* and will be ignored after the last scan"):
+        (session,) = find_loops(recording, params, **options, should_stop=stopping_after(2, [])).sessions
     assert session.frames == 2 and session.odometry is not None
     for stop in (stopping_after(scans - 2 + 2, []), lambda: False):
         done.clear()
@@ -115,6 +116,11 @@ def test_a_search_without_the_odometry_goes_on_too_and_begins_after_the_last_sca
             found = find_loops(recording, params, **options, should_stop=stop, on_progress=done.append)
         assert found.sessions[0].odometry is None
     assert done[0] == scans and done[1] == 2 and found.whole
+    file = tmp_path / "kept" / "of-the-user.bin"
+    file.touch()
+    checkpoint.delete_checkpoint(tmp_path / "kept")
+    assert list((tmp_path / "kept").iterdir()) == [file]
+    file.unlink()
     checkpoint.delete_checkpoint(tmp_path / "kept")
     assert not (tmp_path / "kept").exists()
 

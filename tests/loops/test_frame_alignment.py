@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from session_pairs import loops_between, two_drives
 
 from sglpr_jax.loops.closure import LoopClosure
-from sglpr_jax.loops.frame_alignment import align_frames
+from sglpr_jax.loops.frame_alignment import SegmentAlignment, TrajectorySegment, align_frames
 from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.se3 import inverse, transform, transform_covariance, travelled, yaw_of
 
@@ -72,3 +72,10 @@ def test_one_loop_is_enough_for_a_transform():
     poses = np.stack([np.eye(4), transform(5.0, 0.0, 0.0)])
     found, _ = aligned([loop], poses, poses)
     np.testing.assert_allclose(found @ poses[1], loop.match_from_query, atol=1e-9)
+
+
+def test_a_transform_names_its_scans_unless_both_frames_are_those_of_odometry():
+    match, query = TrajectorySegment(0, 0, 50, True), TrajectorySegment(1, 41, 99, False)
+    transform_of_part = SegmentAlignment(match, query, np.eye(4), np.eye(6), 1)
+    assert "of scans 0-50 and 41-99" in str(transform_of_part)
+    assert "scans" not in str(transform_of_part._replace(query=query._replace(is_odometry=True)))

@@ -102,7 +102,7 @@ def test_the_steps_of_a_graph_add_up_to_the_model_after_100_m(tmp_path):
     metres, radians = step_deviations(np.tile(np.eye(4), (3, 1, 1)), DriftModel())
     assert (metres > 0).all() and (radians > 0).all()
     poses = along([(0, 0), (3, 0)])
-    write_g2o(tmp_path / "a.g2o", [], [(np.arange(len(poses)), poses)], drift=DriftModel(0.1, 0.05))
+    write_g2o(tmp_path / "a.g2o", [], [(np.arange(len(poses)), poses, DriftModel(0.1, 0.05))])
     information = read_g2o(tmp_path / "a.g2o").edges[0][3]
     assert information[0, 0] == pytest.approx(1 / (1.0 + 2.5e-5), rel=1e-6)
 

@@ -113,7 +113,7 @@ def test_scaled_scans_give_poses_in_metres(start):
     poses = kiss_icp.scan_odometry(start, scale=2)
     assert trajectory_error(poses, np.asarray(start.positions)) < 0.5
     assert (
-        ", points up to 50 m, voxels of 0.5 m, motion within scans not removed: no times"
+        ", points up to 50 m, voxels of 0.5 m, motion within scans not removed: no valid times"
         in kiss_icp.describe_odometry(start, OdometryConfig(), scale=2)
     )
 

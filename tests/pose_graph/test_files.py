@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from sglpr_jax.data.formats.pose_files import read_kitti, read_trajectory, read_tum
 from sglpr_jax.files import DataWarning
 from sglpr_jax.loops.closure import LoopClosure
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.pose_graph.files import (
     read_g2o,
     read_loops_jsonl,
@@ -44,7 +45,7 @@ def loops(poses) -> list[LoopClosure]:
 
 
 def test_a_graph_comes_back_from_g2o(tmp_path, poses, loops):
-    write_g2o(tmp_path / "loops.g2o", loops, [(np.arange(6), poses)])
+    write_g2o(tmp_path / "loops.g2o", loops, [(np.arange(6), poses, DriftModel())])
     graph = read_g2o(tmp_path / "loops.g2o")
     found = np.stack([graph.poses[i] for i in range(6)])
     np.testing.assert_array_equal(found[:, :3, 3], poses[:, :3, 3])

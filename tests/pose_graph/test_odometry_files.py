@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from recordings import of_scans
 
+from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.pose_graph.files import write_g2o, write_kitti, write_tum
 from sglpr_jax.pose_graph.odometry_files import match_to_scans, read_odometry, read_stamped
 from sglpr_jax.se3 import transform
@@ -20,7 +21,7 @@ def poses() -> np.ndarray:
 def test_every_format_gives_the_same_poses(tmp_path, poses):
     write_kitti(tmp_path / "kitti.txt", poses)
     write_tum(tmp_path / "tum.txt", poses, np.arange(5.0))
-    write_g2o(tmp_path / "graph.g2o", [], [(np.arange(5), poses)])
+    write_g2o(tmp_path / "graph.g2o", [], [(np.arange(5), poses, DriftModel())])
     np.savetxt(tmp_path / "lidar.txt", poses[:, :3].reshape(5, 12))
     for name, format in (("kitti", "kitti"), ("tum", "auto"), ("tum", "tum"), ("lidar", "lidar")):
         np.testing.assert_allclose(read_odometry(tmp_path / f"{name}.txt", format=format), poses, atol=1e-6)

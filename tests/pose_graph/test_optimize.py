@@ -74,7 +74,7 @@ def test_exact_loops_are_used_although_they_bend_odometry_that_jitters(two_laps)
 def test_loops_at_which_a_solution_bends_are_dropped(two_laps_odometry, second_lap_loops, monkeypatch):
     solved_loops = []
 
-    def solve(odometry, loops, sessions, drift):
+    def solve(odometry, loops, sessions, drifts):
         """Keeps all loops at first, and puts the query of one of them 20 m aside."""
         poses = odometry.copy()
         if not solved_loops:
@@ -136,6 +136,21 @@ def test_loops_fit_the_drift_of_their_session_in_any_order(worse, two_laps, seco
     assert optimize_trajectory(result).inliers.all()
 
 
+def test_the_trajectory_that_drifts_more_is_moved(two_laps):
+    bent = drifted(two_laps, percent=0, deg_per_100m=5)
+    loops = []
+    for frame in range(0, LAPS_FRAMES, 8):
+        nodes = {"match_session": 0, "query_session": 1}
+        loops.append(LoopClosure(frame, frame, np.eye(4), LOOP_COVARIANCE, 0.99, overlap=0.9, **nodes))
+    found = solve_pose_graph({0: two_laps, 1: bent}, loops, {0: DriftModel(), 1: DriftModel().scaled(10.0)})
+    exact_moved_m, bent_moved_m = (
+        np.linalg.norm(found.poses[:, :3, 3] - np.concatenate([two_laps, bent])[:, :3, 3], axis=1)
+        .reshape(2, -1)
+        .max(axis=1)
+    )
+    assert found.inliers.all() and exact_moved_m < 0.1 * bent_moved_m
+
+
 def test_a_third_session_is_placed_through_the_second():
     pair = found_pair()
     (first,) = pair.transforms
@@ -156,7 +171,7 @@ def test_gtsam_reads_the_graph_that_we_write(two_laps_odometry, second_lap_loops
     import gtsam
 
     path = tmp_path / "loops.g2o"
-    write_g2o(path, second_lap_loops, [(np.arange(LAPS_FRAMES), two_laps_odometry)])
+    write_g2o(path, second_lap_loops, [(np.arange(LAPS_FRAMES), two_laps_odometry, DriftModel())])
     graph, start = gtsam.readG2o(str(path), True)
     assert start.size() == LAPS_FRAMES and graph.size() == LAPS_FRAMES - 1 + len(second_lap_loops)
     read = np.stack([start.atPose3(frame).matrix() for frame in range(LAPS_FRAMES)])

@@ -73,6 +73,19 @@ def test_all_pairs_within_three_metres_are_found_and_no_other():
         np.testing.assert_array_equal(found[1], near[~same_visit])
 
 
+def test_a_stop_is_one_visit_and_a_return_is_another():
+    rng = np.random.default_rng(0)
+    x = np.r_[np.arange(0, 60, 2.0), np.full(200, 60.0), np.arange(60, 0, -2.0)]  # a stop, then the way back
+    recording = np.column_stack([x, 0 * x, 0 * x]) + rng.normal(scale=0.1, size=(len(x), 3))
+    pool = TuplePool([recording, recording], TupleConfig(revisit_gap=20), worlds=[0, 0])
+    stop, start, end = 60, 2, len(x) - 3
+    visited = pool.are_of_one_visit(np.array([stop, stop, start, stop]), np.array([stop + 100, 25, end, len(x) + stop]))
+    assert visited.tolist() == [True, False, False, False]
+    revisits = pool.revisits.places[pool.revisits.starts[stop] : pool.revisits.starts[stop + 1]]
+    assert (revisits >= len(x)).all()  # in the other recording only
+    assert pool.revisits.anchors_among(np.array([start])).size
+
+
 def test_three_metres_are_too_far_for_a_positive_and_twenty_too_near_for_a_negative():
     recording = np.zeros((5, 3))
     recording[:, 0] = [0, 3, 20, np.nextafter(3, 0), np.nextafter(20, 21)]

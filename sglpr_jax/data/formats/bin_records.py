@@ -103,8 +103,9 @@ MAX_DIRECTION_DIFFERENCE = 0.12
 MAX_DISTANCE_RATIO = 8.0
 """Maximum ratio of the median distances between rows of a period."""
 MIN_AXES_DIFFERENCE = 0.1
-"""Minimum difference of the distributions of x, y and z (largest Kolmogorov-Smirnov statistic of two of them). In scans
-it is above 0.4. If the columns of a file follow one another, "x", "y" and "z" are samples of one column."""
+"""Minimum difference of the distributions of x, y and z (largest Kolmogorov-Smirnov statistic of two of them). In KITTI
+it is 0.49, and in a small square room 0.2. If the columns of a file follow one another, "x", "y" and "z" are samples of
+one column."""
 SCALED_M = 1.0
 """Clouds whose coordinates are all within this limit are considered scaled, not in metres."""
 MIN_POINTS, MAX_POINTS = 200, 20_000

@@ -36,8 +36,8 @@ CLOCKS_APART_S = 5.0
 """Minimum difference between the delays of two topics, from header to recorder, if their clocks differ, in seconds.
 Most SLAM programs are late by less."""
 MOST_LATE = 0.01
-"""Maximum fraction of messages whose header time is before that of an earlier message. More show a clock that was set
-back."""
+"""Maximum fraction of messages whose header time is before that of an earlier message. More of them, or two in
+succession, show a clock that was set back."""
 
 
 class Header(NamedTuple):
@@ -224,11 +224,13 @@ class Stamps(NamedTuple):
 
     def headers_are_valid(self, *, most_late: float = 0.0) -> bool:
         """Whether the header times are positive and can be seconds (`times.time_unit_problem`), and at most the
-        fraction `most_late` of them is before the time of an earlier message."""
+        fraction `most_late` of them, none in succession, is before the time of an earlier message."""
         if not len(self.header_s) or not (self.header_s > 0).all():
             return False
         is_late = self.header_s < np.maximum.accumulate(self.header_s)
-        return bool(is_late.mean() <= most_late) and not time_unit_problem(np.sort(self.header_s), numbers=False)
+        if is_late.mean() > most_late or (is_late[1:] & is_late[:-1]).any():
+            return False
+        return not time_unit_problem(np.sort(self.header_s), numbers=False)
 
     @property
     def seconds(self) -> Float[np.ndarray, " n"]:
@@ -303,25 +305,25 @@ def tracks_of_transforms(transforms: Iterable[tuple[int, StampedPose]]) -> list[
     return [Track.of(poses) for _, poses in sorted(groups.items())]
 
 
-def times_on_one_clock(
-    messages: Stamps, scans: Stamps, *, source: str
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " q"]]:
+def times_on_one_clock(messages: Stamps, scans: Stamps) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " q"], str]:
     """Return the times of messages, in any order, and of scans in seconds: header times if they have one clock, or else
-    recorder times. Warns, with the name `source` of the messages, if header times overlap but have two clocks."""
+    recorder times. If header times overlap but have two clocks, the last value describes it. Otherwise it is empty."""
     valid = scans.headers_are_valid() and messages.headers_are_valid(most_late=MOST_LATE)
     if not valid or have_poses(messages.header_s, scans.header_s).mean() < LEAST_SHARE:
-        return messages.recorder_s, scans.recorder_s
+        return messages.recorder_s, scans.recorder_s, ""
     if abs(messages.delay_s - scans.delay_s) <= CLOCKS_APART_S:
-        return messages.header_s, scans.header_s
-    # A slow SLAM program is late, but copies the times of the scans. Those of another pass were recorded later.
+        return messages.header_s, scans.header_s, ""
+    # Messages of a slow SLAM program are late, but most such programs copy the times of the scans. Messages of another
+    # pass were recorded after the scans.
     are_copied = np.isin(messages.header_s, scans.header_s).mean() >= LEAST_SHARE
     if are_copied or have_poses(messages.recorder_s, scans.recorder_s).mean() < LEAST_SHARE:
-        return messages.header_s, scans.header_s
-    warn(
-        f"{source}: expected header times on the clock of the scans, found messages recorded {messages.delay_s:.1f} s "
-        f"after their header time, and scans {scans.delay_s:.1f} s after theirs; the times of the recorder are used"
+        return messages.header_s, scans.header_s, ""
+    problem = (
+        f"expected header times on the clock of the scans, found messages recorded {messages.delay_s:.1f} s after "
+        f"their header time, and scans {scans.delay_s:.1f} s after theirs; the times of the recorder are used, which "
+        "are wrong if the messages were computed late"
     )
-    return messages.recorder_s, scans.recorder_s
+    return messages.recorder_s, scans.recorder_s, problem
 
 
 def static_transform(tracks: Iterable[Track], frame: str, other: str) -> Float[np.ndarray, "4 4"] | None:

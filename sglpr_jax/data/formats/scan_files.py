@@ -94,8 +94,8 @@ def scan_names(names: Iterable[str]) -> list[str]:
     Hidden files are skipped, as in `listing.files_in`.
     """
     visible = [name for name in names if not name.startswith(".")]
-    of_kinds = ([name for name in visible if name.lower().endswith(kind)] for kind in (ENDINGS, ARRAY_ENDINGS))
-    return next(filter(None, of_kinds), [])
+    scans = [name for name in visible if name.lower().endswith(ENDINGS)]
+    return scans or [name for name in visible if name.lower().endswith(ARRAY_ENDINGS)]
 
 
 def scan_id(path: Path) -> str:

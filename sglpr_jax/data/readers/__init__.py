@@ -74,8 +74,8 @@ def open_recording(
 
     Raises:
       FileNotFoundError: If the sequence or one of its files is missing.
-      ValueError: If a file is malformed, times decrease, or `format`, `poses`, `pose_format`, `times` or a topic does
-        not apply to the layout.
+      ValueError: If a file is malformed, times decrease, or `poses`, `pose_format`, `times` or a topic does not
+        apply to the layout.
       ImportError: If `root` is a bag and the extra `ros` is not installed.
 
     Example:

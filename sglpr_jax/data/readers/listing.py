@@ -6,8 +6,9 @@ from collections.abc import Iterable
 from decimal import Decimal
 from pathlib import Path
 
-_DECIMAL = re.compile(r"(?P<prefix>(?:.*[^\d.])?)(?P<number>\d+\.\d+)(\.[A-Za-z]\w*)*$")
-"""File name that ends with a decimal number, such as a timestamp, and its extensions: scan_1561000444.39.bin."""
+_DECIMAL = re.compile(r"(?P<prefix>(?:.*[^\d.])?)(?P<number>\d+\.(?:\d*[1-9]|0))(\.[A-Za-z]\w*)*$")
+"""File name that ends with a decimal number without trailing zeros, such as a timestamp, and its extensions:
+scan_1561000444.39.bin. Others are sorted right by their natural order."""
 
 
 def files_in(folder: Path, *endings: str) -> tuple[Path, ...]:

@@ -7,11 +7,13 @@ from pathlib import Path
 from sglpr_jax.data.choices import PoseChoice, PoseFormat, ScanFormat, TimeUnit
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.fields import check_value, field_types
+from sglpr_jax.files import warn
 
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """Options of `open_recording` that are passed to a reader. A reader ignores options that do not apply to it."""
+    """Options of `open_recording` that are passed to a reader. `Reader.check_options` rejects those that do not apply,
+    except `pose_source` and `time_unit`, which are ignored."""
 
     pose_source: PoseChoice = "auto"
     format: ScanFormat = "auto"
@@ -49,7 +51,9 @@ class Reader:
     """Whether `ReadOptions.pose_topic` and `imu_topic` apply."""
 
     def check_options(self, root: Path, options: ReadOptions) -> None:
-        """Raise ValueError if an option for `root` does not apply to the layout."""
+        """Raise ValueError if an option for `root` does not apply to the layout, and warn of a format that does not."""
+        if not self.layout:  # `open` says why it is rejected
+            return
         file = options.poses or options.times
         if file and not self.takes_poses:
             expected = "poses or times for a plain folder of scans"
@@ -57,7 +61,9 @@ class Reader:
         for kind, topic in (("pose", options.pose_topic), ("IMU", options.imu_topic)):
             if topic and not self.takes_topics:
                 raise ValueError(f"{root}: expected a bag with the {kind} topic {topic}, found {self.layout}")
-        for name, applies in (("pose_format", self.takes_poses), ("format", self.takes_format)):
-            value = getattr(options, name)
-            if value != "auto" and not applies:
-                raise ValueError(f"{root}: expected {name} 'auto' for the layout {self.layout}, found {value!r}")
+        if options.pose_format != "auto" and not self.takes_poses:
+            raise ValueError(
+                f"{root}: expected pose_format 'auto' for the layout {self.layout}, found {options.pose_format!r}"
+            )
+        if options.format != "auto" and not self.takes_format:  # of several datasets, it may apply to others
+            warn(f"{root}: expected format 'auto' for the layout {self.layout}, found {options.format!r}, not used")

@@ -135,11 +135,8 @@ def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | N
     for track in transforms:  # tf has poses of the LiDAR if a moving frame is connected with the LiDAR's frame
         if track.moves and static_transform(transforms, track.child, lidar_frame) is not None:
             tracks[f"/tf/{track.frame}/{track.child}"] = track
-    times = {
-        name: times_on_one_clock(track.stamps, scans, source=f"{bag.paths[0]}, {name}")
-        for name, track in tracks.items()
-    }
-    has_pose = {name: have_poses(pose_times, scan_times) for name, (pose_times, scan_times) in times.items()}
+    times = {name: times_on_one_clock(track.stamps, scans) for name, track in tracks.items()}
+    has_pose = {name: have_poses(pose_times, scan_times) for name, (pose_times, scan_times, _) in times.items()}
     shares = {name: float(rows.mean()) for name, rows in has_pose.items()}
     used = _pose_topic(shares, topic, bag.paths[0])
     unused = [f"{name} (poses for {share:.0%} of the scans)" for name, share in shares.items() if name != used]
@@ -151,7 +148,9 @@ def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | N
     if track.dropped:
         found = f"{track.dropped} of {len(track) + track.dropped} without a position on the Earth or without rotation"
         warn(f"{bag.paths[0]}: expected valid poses on {used}, found {found}; these are dropped")
-    pose_times, scan_times = times[used]
+    pose_times, scan_times, problem = times[used]
+    if problem:
+        warn(f"{bag.paths[0]}, {used}: {problem}")
     world_from_child = interpolate_poses(pose_times, track.poses, scan_times[rows])
     warn_of_jumps(world_from_child[:, :3, 3], [recording.ids[i] for i in rows], path=bag.paths[0])
     child_from_lidar, how = _child_from_lidar(track, transforms, lidar_frame)
@@ -226,7 +225,9 @@ def _read_ups(
     stamps, imu_frame, imu = bag.read(topic, read_imu)
     imu_frame = imu_frame.strip("/")
     source = f"{bag.paths[0]}, {topic}"
-    imu_times, scan_times = times_on_one_clock(stamps, scans, source=source)
+    imu_times, scan_times, problem = times_on_one_clock(stamps, scans)
+    if problem:
+        warn(f"{source}: {problem}")
     try:
         with naming(source):
             ups_in_imu, how = imu.with_times(imu_times).ups(scan_times)

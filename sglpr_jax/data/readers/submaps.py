@@ -34,4 +34,4 @@ def reject(root: Path, name: str, options: ReadOptions) -> Recording:
     )
 
 
-READER = Reader("", recording_names, reject, rank=2, takes_format=True)  # rejected in any format
+READER = Reader("", recording_names, reject, rank=2)
