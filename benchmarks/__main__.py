@@ -54,7 +54,7 @@ PROGRAMS = {
     "learned train": Program("learned.train", "train", "equal trainings of the networks of other publications"),
     "learned preset": Program("learned.train", "train_preset", "the same training of a preset"),
     "learned score": Program("learned.score", "score", "scores on unseen recordings"),
-    "learned cost": Program("learned.cost", "cost", "time, size and operations of a descriptor"),
+    "learned cost": Program("learned.cost", "cost", "time and size of a descriptor"),
     "learned leaderboard": Program("learned.leaderboard", "leaderboard", "writes docs/leaderboard.md and its figure"),
     "fleet embed": Program("fleet.ray", "embed", "recipe for Ray: places of many recordings"),
     "fleet loops": Program("fleet.ray", "loops", "recipe for Ray: loops between recordings that may overlap"),

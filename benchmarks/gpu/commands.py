@@ -166,7 +166,7 @@ def _measurements_of(result: TrainResult) -> dict[str, Any]:
         "compute": config.model.compute,
         "tuples": config.tuples,
         "chunk": config.chunk,
-        "speed": None if speed is None else dataclasses.asdict(speed),
+        "speed": None if speed is None else speed._asdict(),
         "metrics": [line for i, line in enumerate(lines) if "score" in line or i % every == 0],
     }
 

@@ -23,21 +23,17 @@ def cost(
     entries: tyro.conf.Positional[tuple[str, ...]],
     *,
     data: Path = Path("build/learned"),
-    runs: Path = Path("build/learned/runs"),
-    out: Path = Path("build/learned/cost.json"),
     scans: int = 20,
 ) -> None:
-    """Measure, and write one JSON file. One core: under `taskset -c 0`.
+    """Measure, and write cost.json in `data`. One core: under `taskset -c 0`.
 
     Args:
         entries: contenders, see `score.py`.
-        data: folder of the recordings.
-        runs: folder of the runs.
-        out: file to write.
+        data: folder of the recordings and of the runs.
         scans: number of scans that each contender describes.
     """
     recording = open_recording(next(folder for folder in folders(data, TEST) if folder.name == TOWN), "00")
-    contenders = [entry(name, runs) for name in entries]
+    contenders = [entry(name, data) for name in entries]
     methods = [contender.method(recording) for contender in contenders]
 
     def describe_row(method: Any, row: int) -> np.ndarray:
@@ -54,4 +50,4 @@ def cost(
     for contender, method, taken in zip(contenders, methods, seconds, strict=True):
         costs[contender.name] = {"ms": 1e3 * taken, "bytes": 4 * describe_row(method, 0).size}
         print(contender.name, json.dumps(costs[contender.name]), flush=True)
-    write_json(out, costs)
+    write_json(data / "cost.json", costs)

@@ -108,7 +108,7 @@ def labels(
     kind: tyro.conf.Positional[Literal["predicted", "none"]],
     *,
     data: Path = Path("build/learned"),
-    out: Path = Path("build/learned-predicted"),
+    out: Path | None = None,
     weights: str = "sglpr",
 ) -> None:
     """Write the recordings with other labels, unless they exist.
@@ -120,9 +120,10 @@ def labels(
     Args:
         kind: labels of `weights`, or none.
         data: folder of the recordings.
-        out: folder of the recordings with other labels.
+        out: folder of the recordings with other labels; build/learned-KIND if omitted.
         weights: weights with a segmentation head.
     """
+    out = out or Path(f"build/learned-{kind}")
     params = sglpr_jax.load(weights)
     of_points = _unlabelled if kind == "none" else lambda scan: _predicted(params, scan)
     for part in (TRAIN, HELD_OUT, TEST):

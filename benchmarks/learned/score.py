@@ -5,14 +5,12 @@ The name of a contender is a handcrafted method (`scan-context`), shipped weight
 """
 
 import json
-import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import numpy as np
 import tyro
 
 import sglpr_jax
@@ -27,21 +25,16 @@ from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.learned.trained import RANDOM
 from sglpr_jax.methods.method import Method, Takes
-from sglpr_jax.methods.registry import handcrafted, method_with_weights, network, trained_method
-from sglpr_jax.models.config import model_preset
+from sglpr_jax.methods.registry import method_named, method_with_weights, network, trained_method
 from sglpr_jax.models.sglpr import init
 from sglpr_jax.models.weights_file import LAST_WEIGHTS
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.distances import distance_function
 from sglpr_jax.retrieval.embed import embed
-from sglpr_jax.revisits import revisits
 from sglpr_jax.training.trainer import SCORES_FILE
-from sglpr_jax.training.validation import FOUND_M
+from sglpr_jax.training.validation import recall_at_1
 
-GRID = model_preset("sglpr").grid
-"""Grid of handcrafted methods on images."""
 ROTATION_SEED = 0
-SPLIT = ("00", "02", "05", "06")
-"""Sequences of KITTI with a published split into map and queries."""
 
 
 class Entry(NamedTuple):
@@ -57,14 +50,11 @@ class Entry(NamedTuple):
     """Training time in seconds."""
 
 
-def entry(name: str, runs: Path) -> Entry:
+def entry(name: str, data: Path) -> Entry:
     """The contender called `name`. Raises FileNotFoundError if there is no method, weights or run of that name."""
     if name in HANDCRAFTED:
-
-        def make_method(recording: Recording) -> Method:
-            return handcrafted(name, None if recording.has_images else GRID)
-
-        return Entry(name, HANDCRAFTED[name].takes, make_method)
+        takes = HANDCRAFTED[name].takes
+        return Entry(name, takes, lambda recording: method_named(name, ready_made=recording.has_images))
     method, _, weights = name.rpartition("@")  # METHOD@random:SEED is untrained
     if name in sglpr_jax.shipped_weights():
         params = sglpr_jax.load(name)
@@ -75,7 +65,7 @@ def entry(name: str, runs: Path) -> Entry:
     if weights.startswith(RANDOM):
         params = init(jax.random.key(int(weights.removeprefix(RANDOM))), preset=method)
         return Entry(name, "images", lambda recording: network(params), 0, 0.0)
-    folder = runs / name
+    folder = data / "runs" / name
     folder = folder / LAST_WEIGHTS if (folder / LAST_WEIGHTS / "config.json").is_file() else folder
     trained = method_with_weights(str(folder))
     images, seconds = _training_effort(folder)
@@ -107,41 +97,34 @@ def score(
     entries: tyro.conf.Positional[tuple[str, ...]],
     *,
     data: Path = Path("build/learned"),
-    runs: Path = Path("build/learned/runs"),
-    out: Path = Path("build/learned/scores"),
     kitti: Path | None = None,
-    part: str = TEST,
     only: str = "",
 ) -> None:
     """Score contenders and print a line for each recording.
 
     Every contender describes the test recordings of `data`, and the images of KITTI if it takes images. The town and
-    KITTI are also described with every scan rotated. A result is a JSON file of one contender and one recording.
-    Existing results are kept.
+    KITTI are also described with every scan rotated. A result is a JSON file of one contender and one recording,
+    in the folder `scores` of `data`. Existing results are kept.
 
     Args:
         entries: contenders, see the head of this file.
-        data: folder of the recordings.
-        runs: folder of the runs.
-        out: folder of the results.
+        data: folder of the recordings and of the runs.
         kitti: folder of KITTI's images, NN/imgs/*.png with NN/pose.txt.
-        part: part of `data` to score on. Scores on "train" distinguish networks that did not learn from those that do
-            not generalise.
         only: beginning of the names of the test recordings to score on.
     """
-    tests = [test for test in [*_simulated(data, part), *_kitti(kitti)] if test.name.startswith(only)]
+    tests = [test for test in [*_simulated(data), *_kitti(kitti)] if test.name.startswith(only)]
     for name in entries:
-        contender = entry(name, runs)
+        contender = entry(name, data)
         for test in tests:
             if _fits(contender, test):
-                result = _result(contender, test, out / name.replace("/", "_").replace(":", "-"))
+                result = _result(contender, test, data / "scores" / name.replace("/", "_").replace(":", "-"))
                 scores = (f"{key} {value:.3f}" for key, value in result["scores"].items())
                 print(f"{name}, {test.name}: {', '.join(scores)}", flush=True)
 
 
-def _simulated(data: Path, part: str) -> Iterator[Test]:
+def _simulated(data: Path) -> Iterator[Test]:
     by_world: dict[str, tuple[str, Recording]] = {}
-    for folder in folders(data, part):
+    for folder in folders(data, TEST):
         recordings = recordings_of(folder)
         if folder.name.startswith("days"):
             yield Test(folder.name, recordings[1], recordings[0])
@@ -179,7 +162,7 @@ def _result(contender: Entry, test: Test, folder: Path) -> Mapping[str, Any]:
     if test.database is not None:
         scores = {"recall": BEVPLACE_NCLT_RECALL(_described(contender, test.database), file).score}
     else:
-        scores = _scores(file, split=test.name.startswith("kitti-") and test.name.split("-")[1] in SPLIT)
+        scores = _scores(file, split=test.name.startswith("kitti-"))
     about = {"images": contender.images, "seconds": contender.seconds, "numbers": file.descriptors.shape[1]}
     result = {"entry": contender.name, "test": test.name, **about, "weights": file.weights_hash, "scores": scores}
     folder.mkdir(parents=True, exist_ok=True)
@@ -194,20 +177,7 @@ def _described(contender: Entry, recording: Recording, *, rotated: bool = False)
 
 def _scores(file: DescriptorFile, *, split: bool) -> dict[str, float]:
     """Return top-1 F1max, F1max of pairs, Recall@1 within 5 m and, for a split sequence, that of BEVPlace++."""
-    top1 = TOP1_F1MAX(file)
-    scores = {"top1": top1.score, "pairs": PAIRS_F1MAX(file).score, "recall": _recall(file, top1.answers)}
+    assert file.positions is not None
+    recall = recall_at_1(file.descriptors, file.positions, file.times, distance_function(file.distance))
+    scores = {"top1": TOP1_F1MAX(file).score, "pairs": PAIRS_F1MAX(file).score, "recall": recall}
     return scores | ({"split recall": BEVPLACE_RECALL_AT_1(file).score} if split else {})
-
-
-def _recall(file: DescriptorFile, answers: np.ndarray | None) -> float:
-    """Fraction of the revisits whose answer is within FOUND_M (5 m) in x and y, or NaN without revisits.
-
-    `answers` are frames, or -1 for no answer.
-    """
-    assert file.positions is not None and answers is not None
-    xy = file.positions[:, :2]
-    rows = np.flatnonzero(revisits(xy, times=file.times, radius_m=FOUND_M))
-    if not len(rows):
-        return math.nan
-    distance = np.linalg.norm(xy[rows] - xy[answers[rows]], axis=1)
-    return float(np.mean((distance <= FOUND_M) & (answers[rows] >= 0)))

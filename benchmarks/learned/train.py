@@ -48,7 +48,6 @@ UPRIGHT = "upright"
 def train(
     *,
     data: Path = Path("build/learned"),
-    out: Path = Path("build/learned/runs"),
     methods: Sequence[str] = LEARNED_NAMES,
     seeds: Sequence[int] = (0, 1),
     seconds: float = 3600.0,
@@ -59,8 +58,7 @@ def train(
     """Train every method with every seed, one after the other. Interrupted trainings are continued.
 
     Args:
-        data: folder of the recordings.
-        out: folder of the runs, METHOD-SEED.
+        data: folder of the recordings, and of the runs, runs/METHOD-SEED.
         methods: names of the methods.
         seeds: seeds of weights, tuples and rotations.
         seconds: training time of each run.
@@ -68,7 +66,7 @@ def train(
         search_seconds: training time of each of the three learning rates. Further seeds use the rate of the first.
         learning_rate: rate of all runs, in place of the search.
     """
-    (held_out,) = folders(data, HELD_OUT)
+    (held_out,), out = folders(data, HELD_OUT), data / "runs"
     for method in methods:
         for seed in seeds:
             run, first = out / f"{method}-{seed}", out / f"{method}-{seeds[0]}" / RATES / RATES_FILE
@@ -131,9 +129,7 @@ class Settings:
     """Name of a file in configs/, or path of your own file."""
     seed: int = 0
     data: Path = Path("build/learned")
-    """Folder of the recordings of `data`."""
-    out: Path = Path("build/learned/runs")
-    """Folder of the runs, PRESET-SEED."""
+    """Folder of the recordings of `data`, and of the runs, runs/PRESET-SEED."""
     seconds: float = 3600.0
     """Training time, without scores and compilation."""
     images: int = 0
@@ -151,7 +147,7 @@ class Settings:
     @property
     def folder(self) -> Path:
         """Folder of the run."""
-        return self.out / f"{Path(self.preset).stem}-{self.seed}"
+        return self.data / "runs" / f"{Path(self.preset).stem}-{self.seed}"
 
 
 def train_preset(settings: tyro.conf.OmitArgPrefixes[Settings]) -> None:

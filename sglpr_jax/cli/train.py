@@ -38,7 +38,7 @@ class TrainCommand:
       bin/train --seq friday --data monday tuesday.bag friday    own scans, with poses beside them; no labels needed
       bin/train --seq 06 --data IMAGES --also SIMULATED --also-tuples 4     semantics from a second, labelled dataset
       bin/train --seq 08 --optimizer.learning-rate 1e-4   any field of the preset can be set
-      bin/train --seq 08 --model.head.cbam False          an ablation; docs/guides/ablations.md lists all
+      bin/train --seq 08 --model.head.cbam False          an ablation; docs/guides/reproduce.md lists all
       bin/train --preset paper --hosts 2 --host-index 0 --coordinator 10.0.0.1:1234   docs/guides/training.md
     """
 

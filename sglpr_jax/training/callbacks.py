@@ -43,9 +43,6 @@ class Callback:
     def on_score(self, step: int, scores: Mapping[str, float]) -> None:
         """Called every `score_every` steps with the scores of the weights."""
 
-    def on_checkpoint(self, step: int) -> None:
-        """Called after the checkpoint that follows a score is written, not for other checkpoints, as after a stop."""
-
     def on_end(self, step: int) -> None:
         """Called after the last step, or after this step if the run was asked to stop. The weights are saved."""
 
@@ -58,7 +55,7 @@ class Callbacks(Callback):
 
     def __init__(self, *callbacks: Callback):
         self._callbacks = callbacks
-        for name in ("on_pack", "on_start", "on_step", "on_score", "on_checkpoint", "on_end"):
+        for name in ("on_pack", "on_start", "on_step", "on_score", "on_end"):
             setattr(self, name, functools.partial(self._call_each, name))
 
     def close(self) -> None:

@@ -6,6 +6,7 @@ float32 rounding. Each of several hosts has one process, which reads its part of
 
 import contextlib
 import math
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
@@ -37,8 +38,8 @@ def data_mesh(config: TrainConfig, devices: Sequence[Any] | None = None) -> Mesh
     hosts, available = len(devices_by_host), min(map(len, devices_by_host.values()))
     work = f"the {config.tuples} tuples of a step and the {config.images_at_once} images of a chunk"
     divisible = math.gcd(config.tuples, config.images_at_once)
-    if config.also_tuples:  # a batch of two datasets stays on one device
-        divisible = 1
+    if config.also_tuples:
+        divisible, work = 1, "1, because a batch of two datasets stays on one device"
     used = max((n for n in range(1, available + 1) if divisible % (n * hosts) == 0), default=0)
     if not used:
         raise ValueError(f"expected {work} to be divisible by the number of hosts, found {hosts} hosts")
@@ -104,7 +105,7 @@ def connected(*, hosts: int, host_index: int, coordinator: str | None) -> Iterat
     if hosts == 1:
         yield
         return
-    if coordinator is None or not coordinator.rpartition(":")[2].isdigit():
+    if coordinator is None or not re.fullmatch(r".+:\d+", coordinator):
         raise ValueError(f"{hosts} hosts need a coordinator: expected the first host's HOST:PORT, found {coordinator}")
     try:
         jax.distributed.initialize(

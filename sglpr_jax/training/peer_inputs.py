@@ -71,16 +71,16 @@ def _write_inputs(path: Path, method: LearnedMethod, recording: Recording, show)
     check_readable(recording, len(recording))
     options = {"labels": method.takes in LABELLED, "ahead": SCANS_AHEAD, "on_progress": show}
     stream = scan_stream(recording, lambda row, scan: method.prepare(scan), **options)
-    with replacing(path) as temporary:
-        file = None
+    with replacing(path) as temporary, temporary.open("wb") as file:  # in a memory map, a full disk ends the process
+        first = None
         for row, inputs in stream:
             assert inputs is not None  # without `on_bad_scan`, a bad scan is an error
-            if file is None:
-                shape = (len(recording), *inputs.shape)
-                file = np.lib.format.open_memmap(temporary, mode="w+", dtype=inputs.dtype, shape=shape)
-            _require_same_shape(inputs, file[0], name=f"scan {recording.ids[row]} of sequence {recording.name}")
-            file[row] = inputs
-        del file  # writes it to disk
+            if first is None:
+                first, descr = inputs, np.lib.format.dtype_to_descr(inputs.dtype)
+                header = {"descr": descr, "fortran_order": False, "shape": (len(recording), *inputs.shape)}
+                np.lib.format.write_array_header_1_0(file, header)
+            _require_same_shape(inputs, first, name=f"scan {recording.ids[row]} of sequence {recording.name}")
+            file.write(inputs.tobytes())
 
 
 def _require_same_shape(inputs: np.ndarray, expected: np.ndarray, *, name: str) -> None:

@@ -29,7 +29,7 @@ from sglpr_jax.training.run_folder import CONFIG_FILE, lock_run
 from sglpr_jax.training.step import Gradient, TrainState
 from sglpr_jax.training.trainer import Schedule, Trained, Trainer
 from sglpr_jax.training.tuples import TuplePool, positions_of, tuple_pool
-from sglpr_jax.training.validation import RECALL, recall_at_1, require_revisits
+from sglpr_jax.training.validation import RECALL, recall_at_1
 
 RATES_FILE = "rates.json"
 LIMITS = ("settings.seconds", "settings.images")
@@ -63,13 +63,10 @@ class RunSettings:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class HeldOutScore:
-    """Score of a method's weights on held-out recordings. Raises ValueError if a recording has no revisits."""
+    """Score of a method's weights on held-out recordings, which must have revisits (`require_revisits`)."""
 
     method: LearnedMethod
     held_out: TrainingInputs
-
-    def __post_init__(self):
-        require_revisits(self.held_out.recordings)
 
     def __call__(self, variables: Variables) -> dict[str, float]:
         """Return `recall_at_1 NAME` for each recording, and the mean `recall_at_1`, which selects the best weights."""
@@ -224,10 +221,8 @@ class _ReportLines(Callback):
             self._report(self._line)
 
     def on_score(self, step: int, scores: Mapping[str, float]) -> None:
-        self._report(", ".join(f"{name} {value:.3f}" for name, value in scores.items() if name.startswith(RECALL)))
-
-    def on_checkpoint(self, step: int) -> None:
-        self._report(self._line)
+        recalls = (f"{name} {value:.3f}" for name, value in scores.items() if name.startswith(RECALL))
+        self._report(", ".join((self._line, *recalls)))
 
 
 def _first_state(network: PeerNetwork, data: TrainingInputs, pool: TuplePool, learning_rate: float) -> TrainState:

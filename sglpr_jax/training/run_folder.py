@@ -21,13 +21,6 @@ CONFIG_FILE = "config.json"
 ENVIRONMENT_FILE = "environment.json"
 CHECKPOINTS = "checkpoints"
 PACKAGES = ("sglpr-jax", "jax", "jaxlib", "flax", "optax", "numpy")
-REMOVED = {
-    "config.select": "last",
-    "config.loss.closest_positive": True,
-    "config.loss.reduction": "max",
-    "config.optimizer.weight_decay": 0.0,
-}
-"""Removed settings, which older runs still have in config.json, and the value that all runs have today."""
 _CHECKOUT = Path(__file__).resolve().parents[2]
 
 
@@ -84,7 +77,7 @@ def _different_settings(old: Any, new: Any, name: str = "") -> set[str]:
     different: set[str] = set()
     for key in old.keys() | new.keys():
         key_name = f"{name}.{key}" if name else key
-        different |= _different_settings(old.get(key), new.get(key, REMOVED.get(key_name)), key_name)
+        different |= _different_settings(old.get(key), new.get(key), key_name)
     return different
 
 

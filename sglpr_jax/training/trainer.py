@@ -179,7 +179,6 @@ class Trainer:
             if scores:
                 self._callback.on_score(step, self._log(self._scores_file, scores))
             self._save_checkpoint()
-            self._callback.on_checkpoint(step)
         elif self._run.seconds >= self._last_checkpoint_s + schedule.save_every_s:
             self._save_checkpoint()
         if not self._unlogged_metrics:  # a line was logged

@@ -35,8 +35,8 @@ RUN = (
     "fleet index --drives drawn.npz --places 2000 --queries 3",
     f"learned data --out learned --only test/town-601 train-images/vlp16-61 {SMALL}",
     f"learned sampler --data learned --part train-images {LIGHT}",
-    "learned score ring --data learned --only town-601-00 --out learned/scores",
-    "learned cost rinet@random:0 --data learned --scans 1 --out learned/cost.json",
+    "learned score ring --data learned --only town-601-00",
+    "learned cost rinet@random:0 --data learned --scans 1",
     "learned leaderboard --build learned --kept kept.json --page page.md --figure figure.svg",
 )
 """In order: some read what others have written."""

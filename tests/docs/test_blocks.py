@@ -52,7 +52,7 @@ def test_command_lines_of_benchmarks_are_parsed(line, monkeypatch):
 
 
 def test_nothing_else_is_unknown():
-    known = ("bin/", "python ", "pip install", "for ", "done", "docker ")  # the last: tests/test_docker.py
+    known = ("bin/", "git ", "python ", "pip install", "for ", "done", "docker ")  # the last: tests/test_docker.py
     assert not [(name_of(page), line) for page, line in COMMANDS if not line.startswith(known) and "s." not in line]
     assert {block.language for page in PAGES for block in blocks(page)} <= {"bash", "python", "text"}
 

@@ -29,6 +29,7 @@ from sglpr_jax.training.peers import (
     variables_of,
 )
 from sglpr_jax.training.step import train_step
+from sglpr_jax.training.validation import require_revisits
 
 SECTORS = 24
 MINED = TupleConfig(positives=1, negatives=2, revisit_gap=5, mining="hardest", hardest=4, refresh_steps=4)
@@ -155,7 +156,7 @@ def test_recordings_that_do_not_fit_are_errors(tmp_path):
         prepare_inputs(TINY, [dataclasses.replace(loop("a", 0), resolution_m=0.4)], tmp_path)
     straight = dataclasses.replace(loop("c", 2), positions=np.arange(60.0)[:, None] * [10, 0, 0])
     with pytest.raises(ValueError, match="sequence c: expected revisits within 5 m"):
-        HeldOutScore(TINY, prepare_inputs(TINY, [straight], tmp_path))
+        require_revisits([straight])
 
 
 def test_a_step_is_that_of_adam_with_weight_decay():

@@ -1,15 +1,13 @@
 """The folder of a run records settings, environment and command of each start."""
 
-import contextlib
 import json
 import subprocess
 import sys
 
 import jax
 import numpy as np
-import pytest
 
-from sglpr_jax.training.run_folder import git_commit, note_environment, require_same_settings
+from sglpr_jax.training.run_folder import git_commit, note_environment
 
 
 def git(folder, *arguments):
@@ -44,10 +42,3 @@ def test_git_commit_returns_the_commit_and_whether_files_differ(tmp_path):
     assert git_commit(tmp_path) == {"commit": commit, "dirty": False}
     (tmp_path / "file").write_text("b")
     assert git_commit(tmp_path) == {"commit": commit, "dirty": True}
-
-
-def test_a_removed_setting_may_be_stored_with_the_value_of_today(tmp_path):
-    for stored, fits in (("last", True), ("best", False)):
-        (tmp_path / "config.json").write_text(json.dumps({"config": {"select": stored, "steps": 3}}))
-        with contextlib.nullcontext() if fits else pytest.raises(ValueError, match=r"others: config\.select"):
-            require_same_settings(tmp_path, {"config": {"steps": 3}}, limits=())
