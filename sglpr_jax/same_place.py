@@ -9,5 +9,5 @@ EXCLUDED_S = 30.0
 EXCLUDED_FRAMES = 290
 """Replaces EXCLUDED_S for sequences without times: 30 s at KITTI's 9.6 scans per second."""
 SAME_PASS_FRAMES = 50
-"""Maximum difference of the frame numbers of two scans of one pass, in training. It is smaller than EXCLUDED_FRAMES,
+"""Minimum length of one pass, in frames, in training (`TupleConfig.revisit_gap`). It is smaller than EXCLUDED_FRAMES,
 because a vehicle that returns after 5 s also gives training pairs."""

@@ -6,9 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+import sglpr_jax
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.loops.closure import LoopClosure, planar_loop
+from sglpr_jax.models.weights import Params
 from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.se3 import inverse, transform, yaw_of
 from sglpr_jax.sim import recording
@@ -43,6 +46,11 @@ def part_of_drive(rows: Sequence[int], name: str = "08") -> SimulatedRecording:
     whole, rows = simulated_drive(), list(rows)
     poses = TimedPoses(whole.poses.world_from_lidar[rows], whole.poses.times[rows])
     return dataclasses.replace(only(whole, rows), name=name, rows=None, poses=poses)
+
+
+@pytest.fixture(scope="session")
+def params() -> Params:
+    return sglpr_jax.load("sglpr-small")
 
 
 @pytest.fixture(scope="session")
@@ -131,3 +139,9 @@ def rooms() -> np.ndarray:
     room = [(1.0, 1.0), (4.0, 1.0), (4.0, 4.0), (1.0, 4.0), (1.0, 1.0)]
     first = [(0.0, 0.0), *room]
     return along([*first, *((x + 8.0, y) for x, y in first), (8.0, 1.0)], 0.25)
+
+
+def error_of(found: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
+    """Metres and degrees between two poses."""
+    apart = inverse(expected) @ found
+    return float(np.linalg.norm(apart[:3, 3])), float(np.degrees(Rotation.from_matrix(apart[:3, :3]).magnitude()))

@@ -2,9 +2,6 @@
 
 import inspect
 
-import jax
-import pytest
-
 import sglpr_jax
 
 PUBLIC = [(name, getattr(sglpr_jax, name)) for name in sglpr_jax.__all__]
@@ -35,8 +32,3 @@ def test_key_comes_first_and_options_are_named():
                 assert position == 0
             elif parameter.default is not parameter.empty and (name, parameter.name) not in INPUTS_NOT_OPTIONS:
                 assert parameter.kind is parameter.KEYWORD_ONLY, (name, parameter.name)
-
-
-def test_an_unknown_preset_lists_those_that_exist():
-    with pytest.raises(ValueError, match=r"\(sglpr, .*'smal'"):
-        sglpr_jax.init(jax.random.key(0), preset="smal")

@@ -174,9 +174,6 @@ def open_recordings(command: TrainCommand) -> "tuple[Sequence[Recording], Sequen
         raise ValueError("--data: expected a dataset, found none")
     options = {name: getattr(command, name) for name in ("pose_source", "format", "sensor_height")}
     recordings, test = leave_one_out(roots, command.seq, train_seqs=command.train_seq, **options)
-    for name in command.method:
-        if name in HANDCRAFTED:
-            require_content(name, HANDCRAFTED[name].takes, test, every_label=True)
     also = [recording for folder in command.also for recording in all_recordings(folder, **options)]
     resolved = {root.resolve() for root in roots}
     if same := [folder for folder in command.also if folder.resolve() in resolved]:
@@ -186,6 +183,9 @@ def open_recordings(command: TrainCommand) -> "tuple[Sequence[Recording], Sequen
     if command.skip_bad:
         *readable, test = without_bad_scans([*recordings, *also, test], on_bad_scan=report_bad_scan)
         recordings, also = readable[: len(recordings)], readable[len(recordings) :]
+    for name in command.method:
+        if name in HANDCRAFTED:
+            require_content(name, HANDCRAFTED[name].takes, test, every_label=True)
     if command.pseudo_labels is not None:
         recordings = _add_pseudo_labels(recordings, command.pseudo_labels, without_untrained_head(command.config))
     return recordings, also, test

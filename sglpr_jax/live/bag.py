@@ -21,7 +21,7 @@ class BagSource:
     ):
         """Begin after the last scan whose name is in `map_names`."""
         self._root, self._recording, self._rate, self._report = root.resolve(), recording, options.rate, report
-        self._poses = recording.world_from_lidar
+        self._poses = None if options.odometry_topic is None else recording.world_from_lidar
         last_taken = max((row for row in range(len(recording)) if self._scan_name(row) in map_names), default=-1)
         self._rows = range(last_taken + 1, len(recording))
         self._latest: LatestScan[LiveFrame] = LatestScan()

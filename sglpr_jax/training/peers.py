@@ -281,7 +281,7 @@ def best_rate(
             run = train_learned(method, data, settings, folder, resume=resume, report=report, **options)
             if run.seconds < seconds:
                 raise Stopped
-            held_out = [fingerprint(recording) for recording in score.held_out.recordings]
+            held_out = [[recording.name, fingerprint(recording)] for recording in score.held_out.recordings]
             scored = {"step": int(run.state.step), "held_out": held_out}
             scores = read_json(score_file) if score_file.is_file() else {}
             if scores.get("scored") != scored:  # other steps or recordings, or none yet

@@ -257,7 +257,7 @@ def _require_usable_also(config: TrainConfig, recordings: Sequence[Recording], a
     if shared is not None and config.also_triplets and config.share_negatives:
         raise ValueError(
             "share_negatives makes the places of --also negatives of --data: expected no common world, found one of "
-            f"{names[shared.world]} in --data and {shared.name} in --also; move both to --data"
+            f"{names[shared.world]} in --data and {shared.name} in --also; add the second dataset to --data instead"
         )
 
 

@@ -184,23 +184,25 @@ def visit_ends(
     *,
     gap: int,
 ) -> Int[np.ndarray, "n"]:
-    """Return the last place of the visit at each place: `gap` frames later or, if the sensor is still there, when it
-    leaves. A vehicle at a traffic light does not visit the place again and again.
+    """Return the last place of the visit at each place: `gap` frames later, or the last place before the sensor is away
+    for more than `gap` frames. A vehicle at a traffic light does not visit the place again and again.
 
     Arguments:
       pairs: All pairs of places within the positive distance, the earlier place first.
       recording_of: Recording of each place, in order.
       frame_of: Frame of each place, in order within its recording.
-      gap: Minimum length of a visit, in frames.
+      gap: Minimum length of a visit, and maximum absence during it, in frames.
     """
     pairs = pairs[np.lexsort(pairs.T[::-1])]
     first, later = pairs.T
-    rank = np.arange(len(pairs)) - np.searchsorted(first, first) + 1  # 1 for the next place that is near the first one
-    is_stay = frame_of[later] - frame_of[first] == rank  # all frames between are near, too
-    is_stay &= recording_of[first] == recording_of[later]
-    stay_end = np.arange(len(frame_of)) + np.bincount(first[is_stay], minlength=len(frame_of))
     clock = recording_of * (frame_of.max(initial=0) + gap + 1) + frame_of
-    return np.maximum(stay_end, np.searchsorted(clock, clock + gap, side="right") - 1)
+    before = np.where(np.diff(first, prepend=-1) != 0, first, np.roll(later, 1))  # the near place before the later one
+    is_return = clock[later] - clock[before] > gap
+    returns, start = np.cumsum(is_return), np.searchsorted(first, first)
+    stays = returns == returns[start] - is_return[start]  # no return since the first place
+    ends = np.searchsorted(clock, clock + gap, side="right") - 1
+    np.maximum.at(ends, first[stays], later[stays])
+    return ends
 
 
 def _first_unless_empty(preferred: Int[np.ndarray, "_"], fallback: Int[np.ndarray, "_"]) -> Int[np.ndarray, "_"]:

@@ -2,6 +2,7 @@
 
 import json
 import re
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,8 @@ LINES = {
     "train": ("--seq", "07", "--preset", "sglpr-small", "--model.head.cbam", "True", "--optimizer.clip-norm", "None"),
 }
 """A command line of each command, with texts that YAML or a careless reader takes for other values."""
-TINY = Path(__file__).resolve().parents[1] / "tiny.py"
+ROOT = Path(__file__).resolve().parents[2]
+TINY = ROOT / "tests" / "tiny.py"
 
 
 def parsed(name: str, *arguments: object) -> Any:
@@ -131,3 +133,12 @@ def test_a_flag_sets_the_backbone_of_the_preset_and_flags_of_other_backbones_are
     assert (swin.backbone.kind, swin.backbone.window, swin.backbone.patch) == ("swin", 4, 4)
     ended = run_command("train", "--preset", "paper", "--model.backbone.stem.average", "4")
     assert_one_line_error(ended, "found '--model.backbone.stem.average'")
+
+
+def test_every_command_has_a_script_and_an_entry_point():
+    scripts = {path.name: path.read_text() for path in (ROOT / "bin").iterdir() if path.stat().st_mode & 0o111}
+    assert scripts.keys() == COMMANDS.keys() | {"_command", "_python", "docs", "test"}
+    for name in COMMANDS:
+        assert scripts[name].splitlines()[-1].endswith(f'/_command" {name} "$@"') and all(load_command(name))
+    installed = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    assert installed == {f"sglpr-{name}": "sglpr_jax.cli.__main__:main" for name in COMMANDS}

@@ -65,24 +65,6 @@ def test_a_stopped_node_continues_its_map(town, tmp_path):
     assert (out / "grid.pgm").exists()
 
 
-def test_a_cloud_needs_odometry(tmp_path):
-    ended = run_command("live", f"folder:{tmp_path}", "--out", tmp_path / "map", "--cloud", tmp_path / "cloud.ply")
-    assert ended.status == 1 and "expected --odometry-topic or --poses, found neither" in ended.error
-    assert not (tmp_path / "map").exists()
-
-
-@pytest.mark.parametrize(
-    ("source", "flags", "expected"),
-    [
-        ("bag:a.mcap", ("--poses", "a.tum"), "bag:a.mcap: expected odometry by --odometry-topic, found --poses"),
-        ("folder:.", ("--odometry-topic", "/odom"), "folder:.: expected odometry by --poses, found --odometry-topic"),
-    ],
-)
-def test_odometry_of_another_source_is_refused(tmp_path, source, flags, expected):
-    ended = run_command("live", source, *flags, "--out", tmp_path / "map")
-    assert ended.status == 1 and expected in ended.error
-
-
 def test_a_missing_package_is_told_before_anything_is_loaded(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
     monkeypatch.delitem(sys.modules, "sglpr_jax.live.rerun", raising=False)

@@ -11,7 +11,7 @@ from sglpr_jax.odometry.drift_check import OdometryCheck
 from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.pose_graph.files import read_g2o, read_loops_jsonl, write_tum
 
-from .conftest import SCANS, WALK, assert_one_line_error
+from .conftest import SCANS, WALK
 
 FILES = {"loops.g2o", "loops.jsonl", "loops.csv", "rejected.jsonl", "index.html", "command.json"}
 TRAJECTORIES = {f"trajectory{kind}" for kind in (".tum", ".kitti", "-optimized.tum", "-optimized.kitti")}
@@ -117,15 +117,6 @@ def test_rejected_pairs_and_missing_loops_are_explained(command, town, tmp_path,
     assert read_g2o(tmp_path / "found" / "loops.g2o").edges == []
     rows = map(json.loads, (tmp_path / "found" / "rejected.jsonl").read_text().splitlines())
     assert [row["reason"] for row in rows] == ["repeats", "degenerate"]
-
-
-@pytest.mark.parametrize("name", ["trajectory-optimized.tum", "loops.g2o"])
-def test_input_that_the_run_would_overwrite_is_refused(command, town, odometry, tmp_path, name):
-    path = tmp_path / "found" / name
-    write_tum(path, odometry, np.arange(float(SCANS)))
-    ended = command("loops", town, "--seq", "08", "--out", tmp_path / "found", "--odometry", path)
-    assert_one_line_error(ended, f"{name}: expected inputs that this run does not overwrite")
-    assert path.exists()
 
 
 @pytest.mark.parametrize(("layout", "said"), [("town", None), ("images", "because 06 has ready-made images")])

@@ -90,7 +90,7 @@ def test_other_settings_are_refused_and_more_steps_continue_a_run(reproduced, co
     assert more.status == 0 and "0 of them already trained" in more.error
     assert read_metrics(folder / "full" / "08" / "metrics.jsonl")[-1]["step"] == 4  # only said, not done
     longer = shutil.copytree(folder, tmp_path / "longer")
-    assert command("reproduce", "table5", *options, "--out", longer, "--steps", 6).status == 0
+    assert command("reproduce", "figure6", *options, "--out", longer, "--steps", 6).status == 0
     assert read_metrics(longer / "full" / "08" / "metrics.jsonl")[-1]["step"] == 6
 
 

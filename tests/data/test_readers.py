@@ -166,7 +166,7 @@ def test_poses_in_other_axes_than_those_of_the_layout_are_told(kitti_root, bev_r
         open_recording(bev_root)
 
 
-def test_a_format_that_the_layout_defines_is_refused(kitti_root, bev_root):
+def test_a_format_that_the_layout_defines_is_not_used(kitti_root, bev_root):
     for root in (kitti_root, bev_root):
         (root / "simulation.json").write_text('{"sensor": {"height_m": 1.73}}')
         with pytest.raises(ValueError, match=r"expected pose_format 'auto' for the layout .*, found 'lidar'"):

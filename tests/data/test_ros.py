@@ -315,6 +315,9 @@ def test_few_messages_may_come_late_but_a_clock_may_not_be_set_back():
     assert not Stamps(scans.recorder_ns, one_late).headers_are_valid()
     *found, _ = times_on_one_clock(Stamps(scans.recorder_ns, one_late), scans)
     np.testing.assert_array_equal(found, (one_late, times))
+    overtaken = times[np.r_[:50, 52, 50, 51, 53:4000]]
+    *found, _ = times_on_one_clock(Stamps(scans.recorder_ns, overtaken), scans)
+    np.testing.assert_array_equal(found, (overtaken, times))
     set_back = np.where(times < 110, times, times - 1)
     *found, _ = times_on_one_clock(Stamps(scans.recorder_ns, set_back), scans)
     np.testing.assert_array_equal(found, (scans.recorder_s, scans.recorder_s))

@@ -16,7 +16,12 @@ from sglpr_jax.models.config import model_preset
 from .pages import PAGES, ROOT, blocks, command_lines, name_of
 
 COMMANDS = [(page, line) for page in PAGES for b in blocks(page) if b.language == "bash" for line in command_lines(b)]
-WITH_PYTHON = [page for page in PAGES if any(block.language == "python" for block in blocks(page))]
+LONG = ("README.md", *(f"docs/guides/{name}.md" for name in ("loops", "maps", "sessions")))
+"""Pages whose programs are optimised (tests/conftest.py), one after the other."""
+WITH_PYTHON = sorted(
+    (page for page in PAGES if any(block.language == "python" for block in blocks(page))),
+    key=lambda page: name_of(page) not in LONG,
+)
 
 
 def lines_of(*, start: str) -> list[str]:

@@ -55,9 +55,7 @@ def test_contour_context_outcome_gives_the_published_f1max(shared):
     assert round(result.recalls[1], 4) == 0.9481
 
 
-@pytest.mark.parametrize(
-    ("sequence", "revisits"), [("00", 777), ("02", 296), ("05", 425), ("06", 268), ("07", 28), ("08", 321)]
-)
+@pytest.mark.parametrize(("sequence", "revisits"), [("05", 425), ("06", 268), ("07", 28)])
 def test_numbers_of_revisits_equal_those_of_logg3d_net(shared, make_file, sequence, revisits):
     positions, times, _ = kitti_trajectory(shared / "data/kitti_odometry", sequence, pose_source="semantickitti")
     result = TOP1_F1MAX(make_file(positions, positions, times=times, sequence=sequence))

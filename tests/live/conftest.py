@@ -3,9 +3,8 @@
 import dataclasses
 
 import pytest
-from drives import PASS, street
+from drives import PASS, params, street  # noqa: F401
 
-import sglpr_jax
 from sglpr_jax.live.data_types import LiveFrame
 
 SCANS = 2 * PASS
@@ -14,11 +13,6 @@ BEGIN = 1_700_000_000.25
 
 
 drive = street
-
-
-@pytest.fixture(scope="session")
-def params():
-    return sglpr_jax.load("sglpr-small")
 
 
 class Said(list):

@@ -4,21 +4,14 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 import pytest
-from drives import drive, revisit, street  # noqa: F401
+from drives import drive, params, revisit, street  # noqa: F401
 
-import sglpr_jax
 from sglpr_jax.loops.comparison import Candidate, KeyframeComparison
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Keyframe, describe_scan
 from sglpr_jax.loops.probability import Evidence
-from sglpr_jax.models.weights import Params
 from sglpr_jax.registration.bev_alignment import BevRegistration
 from sglpr_jax.se3 import yaw_of
-
-
-@pytest.fixture(scope="session")
-def params() -> Params:
-    return sglpr_jax.load("sglpr-small")
 
 
 @pytest.fixture(scope="session")

@@ -133,6 +133,19 @@ def test_too_few_loops_or_too_short_a_path_are_no_common_place():
         assert {one.reason for one in rejected} <= {"too few neighbours"}
 
 
+def test_the_path_between_two_days_of_a_map_is_no_drift():
+    middle, rng = len(FIRST) // 2, np.random.default_rng(3)
+    days = np.concatenate([FIRST[:middle], transform(5000.0, 0.0, 0.0)[None], FIRST[middle:]])
+    motion, loops = BevOdometry.joined([BevOdometry.of(days), BevOdometry.of(SECOND)]), []
+    for is_second_day, true in ((False, TRUE), (True, transform(4.0, 0.0, 0.0) @ TRUE)):
+        near = [loop for loop in loops_between(FIRST, SECOND, true) if (loop.match >= middle) == is_second_day]
+        loops += [
+            loop_at(len(days) + loop.query, loop.match + is_second_day, loop.match_from_query, rng) for loop in near
+        ]
+    sets, rejected = accept_between(sorted(loops, key=lambda loop: loop.query), motion, **RULES, known=len(days))
+    assert len(sets) == 1 and {one.loop.match > middle for one in rejected} == {True}
+
+
 def test_a_place_that_repeats_gives_two_transforms_and_therefore_none():
     farther = transform(12.0, 0.0, 0.0) @ TRUE
     both = sorted([*joined_loops(TRUE), *joined_loops(farther)], key=lambda loop: loop.query)

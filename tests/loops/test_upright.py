@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from drives import error_of
 from recordings import of_scans, reading_scans
 from scipy.spatial.transform import Rotation
 
@@ -43,12 +44,6 @@ def tilted_drive(drive, degrees):
         drive, read=reading_scans(points_of), label_paths=(), mounting=mounting_of(tilted), on_disk=False
     )
     return recording, drive.poses.world_from_lidar @ inverse(tilted)
-
-
-def error_of(found: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
-    """Metres and degrees between two poses."""
-    apart = inverse(expected) @ found
-    return float(np.linalg.norm(apart[:3, 3])), float(np.degrees(Rotation.from_matrix(apart[:3, :3]).magnitude()))
 
 
 @pytest.mark.slow

@@ -2,18 +2,11 @@
 
 import numpy as np
 import pytest
-from drives import PASS, drive, part_of_drive  # noqa: F401
+from drives import PASS, drive, params, part_of_drive  # noqa: F401
 
-import sglpr_jax
 from sglpr_jax.maps.build import map_recording
 from sglpr_jax.maps.place_map import PlaceMap
-from sglpr_jax.models.weights import Params
 from sglpr_jax.sim.recording import SimulatedRecording
-
-
-@pytest.fixture(scope="session")
-def params() -> Params:
-    return sglpr_jax.load("sglpr-small")
 
 
 @pytest.fixture(scope="session")
@@ -24,6 +17,6 @@ def first() -> tuple[SimulatedRecording, np.ndarray]:
 
 
 @pytest.fixture(scope="session")
-def places(first, params) -> PlaceMap:
+def places(first, params) -> PlaceMap:  # noqa: F811
     """The map of these."""
     return map_recording(first[0], params, first[1]).places

@@ -37,24 +37,21 @@ def image_and_kernel(shape, size):
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
 @pytest.mark.parametrize("size, strides, circular", CASES)
-def test_both_forms_are_xlas(size, strides, circular, shape):
-    x, kernel = image_and_kernel(shape, size)
-    expected = reference(x, kernel, strides, circular)
-    for form in (convolve, convolve_as_product):
-        np.testing.assert_allclose(form(x, kernel, strides, circular), expected, atol=2e-5)
+def test_both_forms_and_the_gradient_are_xlas(size, strides, circular, shape):
+    def with_gradient(form, *inputs):
+        found, backward = jax.vjp(lambda x, kernel: form(x, kernel, strides, circular), *inputs)
+        return found, *backward(2 * found)
 
+    @jax.jit
+    def every_form(*inputs):
+        product = convolve_as_product(*inputs, strides, circular)
+        return product, with_gradient(convolve, *inputs), with_gradient(reference, *inputs)
 
-@pytest.mark.slow
-@pytest.mark.parametrize("shape", SHAPES, ids=str)
-@pytest.mark.parametrize("size, strides, circular", CASES)
-def test_the_gradient_is_xlas(size, strides, circular, shape):
-    x, kernel = image_and_kernel(shape, size)
-
-    def gradients(form):
-        return jax.jit(jax.grad(lambda x, k: (form(x, k, strides, circular) ** 2).sum(), (0, 1)))(x, kernel)
-
-    for ours, expected in zip(gradients(convolve), gradients(reference), strict=True):
-        np.testing.assert_allclose(ours, expected, rtol=1e-5, atol=1e-4)
+    product, (ours, *gradients), (expected, *of_xla) = every_form(*image_and_kernel(shape, size))
+    for found in (product, ours):
+        np.testing.assert_allclose(found, expected, atol=2e-5)
+    for found, other in zip(gradients, of_xla, strict=True):
+        np.testing.assert_allclose(found, other, rtol=1e-5, atol=1e-4)
 
 
 @pytest.mark.parametrize("size, strides, circular", CASES)

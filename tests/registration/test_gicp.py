@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from drives import error_of
 from scipy.spatial.transform import Rotation
 
 from sglpr_jax.loops.closure import DEGENERATE_M
@@ -10,12 +11,6 @@ from sglpr_jax.se3 import inverse, transform, transformed
 
 GUESS = np.diag([0.5, 0.5, 0.1, 0.02, 0.02, 0.04]) ** 2
 """Covariance of a first guess."""
-
-
-def error_of(found: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
-    """Metres and degrees between two poses."""
-    apart = inverse(expected) @ found
-    return float(np.linalg.norm(apart[:3, 3])), float(np.degrees(Rotation.from_matrix(apart[:3, :3]).magnitude()))
 
 
 @pytest.fixture(scope="module")

@@ -18,9 +18,22 @@ from sglpr_jax.sim.drive import CARRIERS
 from sglpr_jax.sim.layouts import vary
 from sglpr_jax.sim.recording import simulate_recording, simulate_repeating
 from sglpr_jax.sim.sensor import SENSORS, Sensor, scan
+from sglpr_jax.sim.world import build_world
 
 TINY = Sensor(elevations_deg=(2.0, -2.0, -6.0, -10.0, -14.0, -18.0, -21.0, -24.0), azimuth_steps=60)
 SCANS = 4
+TOWNS = {}
+
+
+@pytest.fixture(autouse=True)
+def _towns_are_built_once(monkeypatch):
+    """Except those of `dataset` and `drive`, which are made before."""
+
+    def built(seeds, xy, times, **options):
+        key = seeds, xy.tobytes(), times.tobytes()
+        return TOWNS.get(key) or TOWNS.setdefault(key, build_world(seeds, xy, times, **options))
+
+    monkeypatch.setattr(recording, "build_world", built)
 
 
 def write(root: Path, **changes) -> Path:
@@ -73,12 +86,12 @@ def test_a_drive_on_the_fly_is_the_one_on_disk(dataset, drive):
         assert 200 < len(drive.points(i)) <= 480 and drive.labels(i).min() > 0
 
 
-def test_points_and_labels_of_a_scan_cost_one_rendering(monkeypatch):
+def test_points_and_labels_of_a_scan_cost_one_rendering(monkeypatch, drive):
     rendered = []
     monkeypatch.setattr(recording, "scan", lambda *a, **k: rendered.append(k["time"]) or scan(*a, **k))
-    fresh = simulate_recording("08", scans=SCANS, sensor=TINY, seed=2)
-    assert len(fresh.points(1)) == len(fresh.labels(1)) and len(fresh.points(2)) == len(fresh.labels(2))
-    assert rendered == [fresh.times[1], fresh.times[2]]
+    drive.render.cache_clear()
+    assert len(drive.points(1)) == len(drive.labels(1)) and len(drive.points(2)) == len(drive.labels(2))
+    assert rendered == [drive.times[1], drive.times[2]]
 
 
 @pytest.mark.slow
@@ -100,10 +113,12 @@ def test_an_interrupted_run_is_resumed_and_its_progress_is_reported(dataset, tmp
     with pytest.raises(KeyboardInterrupt):
         write(tmp_path / "cut", on_progress=interrupt)
     assert not (tmp_path / "cut" / "sequences" / "00" / "poses.txt").exists()
+    kept = next((tmp_path / "cut").rglob("000000.bin"))
+    written_ns = kept.stat().st_mtime_ns
     write(tmp_path / "cut", on_start=lambda found: started.append((found.missing, str(found))), on_progress=done.append)
     assert started == [(("00", "08"), f"{tmp_path / 'cut'}: recordings 00, 08")]
     assert done == sorted(done) and done[-1] == 2 * SCANS
-    assert content(tmp_path / "cut") == content(dataset)
+    assert content(tmp_path / "cut") == content(dataset) and kept.stat().st_mtime_ns == written_ns
 
 
 def test_a_finished_dataset_builds_no_town(dataset, monkeypatch):

@@ -56,7 +56,10 @@ def test_a_drive_shows_the_scenery_stays_clear_and_returns_as_asked(name, revisi
     assert distances(low_shapes(world), driven, reach_m=3.0).min() > 0.9 * scenery.clearance_m
 
 
-@names
+WALLED = sorted(REPEATING.keys() - {"car_park", "orchard", "vineyard", "solar", "terminal", "forest", "field"})
+
+
+@pytest.mark.parametrize("name", WALLED)
 def test_no_wall_is_left_out(name):
     scenery, rng, revisit = REPEATING[name], np.random.default_rng(8), "opposite"
     site = scenery.site(rng, 75 * scenery.speed_mps[0] / 1.5, scenery.is_closed(revisit))
@@ -65,7 +68,7 @@ def test_no_wall_is_left_out(name):
         np.isin(build(site, line, clearance_m=clearance).scene.boxes.label, (BUILDING, FENCE)).sum()
         for clearance in (0.0, scenery.clearance_m)
     ]
-    assert counts[0] == counts[1]
+    assert counts[0] == counts[1] > 0
 
 
 def test_traffic_on_the_highway_keeps_to_other_lanes():

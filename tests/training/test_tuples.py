@@ -75,7 +75,7 @@ def test_all_pairs_within_three_metres_are_found_and_no_other():
 
 def test_a_stop_is_one_visit_and_a_return_is_another():
     rng = np.random.default_rng(0)
-    x = np.r_[np.arange(0, 60, 2.0), np.full(200, 60.0), np.arange(60, 0, -2.0)]  # a stop, then the way back
+    x = np.r_[np.arange(0, 60, 2.0) - 0.95, np.full(200, 60.0), np.arange(60, 0, -2.0)]  # a stop, then the way back
     recording = np.column_stack([x, 0 * x, 0 * x]) + rng.normal(scale=0.1, size=(len(x), 3))
     pool = TuplePool([recording, recording], TupleConfig(revisit_gap=20), worlds=[0, 0])
     stop, start, end = 60, 2, len(x) - 3
