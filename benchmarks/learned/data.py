@@ -94,9 +94,7 @@ def data(
     """
     for one in DATASETS:
         if not only or f"{one.part}/{one.name}" in only:
-            folder = one.folder(out)
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            print(simulate(folder, scans=scans, azimuth_steps=azimuth_steps, **one.options), flush=True)
+            print(simulate(one.folder(out), scans=scans, azimuth_steps=azimuth_steps, **one.options), flush=True)
 
 
 def recordings_of(folder: Path) -> list[Recording]:

@@ -155,9 +155,8 @@ def _fits(contender: Entry, test: Test) -> bool:
 def _result(contender: Entry, test: Test, folder: Path) -> Mapping[str, Any]:
     """Returns the stored scores of a contender on a recording, or computes and stores them."""
     path = folder / f"{test.name}.json"
-    stored = json.loads(path.read_text()) if path.is_file() else None
-    if stored is not None:
-        return stored
+    if path.is_file():
+        return json.loads(path.read_text())
     file = _described(contender, test.recording, rotated=test.rotated)
     if test.database is not None:
         scores = {"recall": BEVPLACE_NCLT_RECALL(_described(contender, test.database), file).score}
@@ -165,7 +164,6 @@ def _result(contender: Entry, test: Test, folder: Path) -> Mapping[str, Any]:
         scores = _scores(file, split=test.name.startswith("kitti-"))
     about = {"images": contender.images, "seconds": contender.seconds, "numbers": file.descriptors.shape[1]}
     result = {"entry": contender.name, "test": test.name, **about, "weights": file.weights_hash, "scores": scores}
-    folder.mkdir(parents=True, exist_ok=True)
     write_json(path, result)
     return result
 

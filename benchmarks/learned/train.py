@@ -80,11 +80,6 @@ def train(
             subprocess.run(program, check=True, env={**os.environ, **ONE_CORE})
 
 
-def stages(folder: Path) -> Iterator[Path]:
-    """Yield the metrics of a run's stages, in their order."""
-    yield from (path for path in (folder / UPRIGHT / METRICS_FILE, folder / METRICS_FILE) if path.is_file())
-
-
 class Clock(Callback):
     """Training time of a run, summed over its stages, without scores and compilation.
 
@@ -95,7 +90,7 @@ class Clock(Callback):
         """Continue the time of the stages in the folder of a run."""
         self._limit_s = limit_s
         self._timed_s, self._timed, self._steps, self._last = 0.0, 0, 0, 0
-        for path in stages(folder):
+        for path in filter(Path.is_file, (folder / UPRIGHT / METRICS_FILE, folder / METRICS_FILE)):
             self._last = 0
             for line in read_metrics(path):
                 self.on_step(int(line["step"]), line)

@@ -73,7 +73,7 @@ def evidence(
     For each world the table has the revisits, the share of them that was compared with the right place, the share for
     which this place fits best, the best wrong fit over the right one (median), and the stated uncertainty of the
     position along the least certain direction. The picture shows a typical revisit of each world over its right place
-    and over the best lookalike: cells of both are white, those of the query are cyan and those of the place red.
+    and over the best lookalike: cells of both are white, those of the query are magenta and those of the place green.
 
     Args:
         drives: folder of `loops`.

@@ -249,21 +249,12 @@ def _processor_s() -> float:
     return times.user + times.system + times.children_user + times.children_system
 
 
-def _cells(counts: Int[np.ndarray, " 10"]) -> list[str]:
+def _cells(counts: Int[np.ndarray, " 10"]) -> list[Any]:
     """Cells of `COLUMNS` from the number of scans, the five `Counts`, and the four numbers of `_pose_counts`."""
     scans, *loop_counts, wrong, in_plane, recalled, revisits = counts.tolist()
     loops = Counts(*loop_counts)
     recall = f"{recalled / revisits:.3f}" if revisits else ""
-    return [
-        str(scans),
-        str(loops.loops),
-        str(loops.right),
-        str(loops.wrong),
-        loops.recall,
-        str(wrong),
-        str(in_plane),
-        recall,
-    ]
+    return [scans, loops.loops, loops.right, loops.wrong, loops.recall, wrong, in_plane, recall]
 
 
 def _pose_counts(drive: DescribedDrive, loops: Sequence[Any]) -> list[int]:

@@ -15,8 +15,8 @@ from sglpr_jax.data.density_image import density_image, density_label_image
 from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
-from sglpr_jax.evaluation.figures import save, segmentation_panel
-from sglpr_jax.evaluation.segmentation import confusion_matrix, score_confusion
+from sglpr_jax.evaluation.figures import save
+from sglpr_jax.evaluation.segmentation import confusion_matrix, draw_map, score_confusion
 from sglpr_jax.grid import DENSITY_MAX_COUNT, DENSITY_RESOLUTION_M
 from sglpr_jax.labels import CATEGORIES, UNLABELLED, to_classes, to_raw
 from sglpr_jax.models.config import model_preset
@@ -221,9 +221,7 @@ def semantics(
     for source, scan in _labelled_scans(scans, range_images):
         found = semantic_map(params, scan)
         if source not in totals:
-            resolution_m = params.config.grid.resolution_m
-            panel = segmentation_panel(found.counts, found.truth, found.predicted, resolution_m=resolution_m)
-            save(panel, out / f"{source.replace(' ', '-')}.png")
+            save(draw_map(found, params.config), out / f"{source.replace(' ', '-')}.png")
         each = [
             confusion_matrix(found.truth, one, counted=found.seen, classes=classes)
             for one in (found.predicted, by_cell)
@@ -236,7 +234,7 @@ def semantics(
         for i in np.flatnonzero(ours.shares).tolist():
             table.add(CATEGORIES[i], f"{ours.shares[i]:.2%}", f"{ours.iou[i]:.3f}", f"{guess.iou[i]:.3f}")
         table.add(f"mean of {ours.n_present} classes", "", f"{ours.mean_iou:.3f}", f"{guess.mean_iou:.3f}")
-        table.add(f"{CATEGORIES[ours.majority]} everywhere", "", f"{ours.majority_mean_iou:.3f}", "")
+        table.add(f"{ours.majority} everywhere", "", f"{ours.majority_mean_iou:.3f}", "")
 
 
 def _labelled_scans(roots: tuple[Path, ...], range_images: Path | None) -> Iterator[tuple[str, Scan]]:

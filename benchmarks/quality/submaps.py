@@ -14,7 +14,7 @@ from benchmarks.table import Table
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.se3 import lengths_along
-from sglpr_jax.sim.drive import PlanarPath, plan_path, timed
+from sglpr_jax.sim.drive import PlanarPath, plan_path, shifted, timed
 from sglpr_jax.sim.recording import drive_through
 from sglpr_jax.sim.world import build_world
 
@@ -109,10 +109,12 @@ def submaps_of_passes(drive: Drive, length_m: float, *, seed: int) -> Recording:
 
 def rendered(sensor: str, seed: int, metres: int, azimuth_steps: int, folder: Path) -> Drive:
     """The five passes, with a scan every metre in a folder (`on_disk`)."""
-    line, left = _street(seed, metres)
+    xy = plan_path(np.random.default_rng((seed, 5)), ROUTE, scans=600, rate_hz=10.0).xy
+    even_m, length_m = np.arange(0.0, metres, 0.5), lengths_along(xy)  # a point every half metre
+    line = np.stack([np.interp(even_m, length_m, axis) for axis in xy.T], axis=1)
     rng, paths, clock = np.random.default_rng((seed, 6)), [], 0.0
     for number, left_m in enumerate(PASSES.values()):
-        pass_line = line + left_m * left
+        pass_line = shifted(line, left_m)
         path = timed(rng, pass_line[::-1] if number % 2 else pass_line, free_mps=SPEED_MPS, poses=metres)
         paths.append(path._replace(times=path.times + clock))
         clock = paths[-1].times[-1] + PAUSE_S
@@ -131,14 +133,3 @@ def rendered(sensor: str, seed: int, metres: int, azimuth_steps: int, folder: Pa
     )
     stored = on_disk(recording, folder / f"{sensor}-{seed}-{metres}-{azimuth_steps}")
     return Drive(stored, recording.poses.world_from_lidar, np.repeat(np.arange(len(PASSES)), metres))
-
-
-def _street(seed: int, metres: int) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
-    """Line of `metres` metres with a point every half metre, and the unit vectors to its left."""
-    xy = plan_path(np.random.default_rng((seed, 5)), ROUTE, scans=600, rate_hz=10.0).xy
-    length_m = lengths_along(xy)
-    even_m = np.arange(0.0, metres, 0.5)
-    line = np.stack([np.interp(even_m, length_m, axis) for axis in xy.T], axis=1)
-    direction = np.gradient(line, axis=0)
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    return line, np.stack([-direction[:, 1], direction[:, 0]], axis=1)

@@ -18,7 +18,7 @@ from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import hypothesis
 from hypothesis import HealthCheck, Phase, given, settings
@@ -43,18 +43,6 @@ SETTINGS = settings(
 """Cases of a round."""
 
 
-class Round(NamedTuple):
-    """Cases of one format."""
-
-    name: str
-    seed: int
-    limit_bytes: int
-    """Memory that reading may take."""
-    limit_s: int
-    """Seconds that a case may take."""
-    out: Path
-
-
 def fuzz(
     *,
     hours: float = 1.0,
@@ -77,7 +65,7 @@ def fuzz(
     begin, outcomes, rounds = time.monotonic(), {name: Counter[str]() for name in only or FORMATS}, 0
     while not rounds or time.monotonic() - begin < 3600 * hours:
         for name, counts in outcomes.items():
-            counts.update(_in_process(Round(name, seed + rounds, int(limit_gb * 1e9), limit_s, out)))
+            counts.update(_in_process(name, seed + rounds, int(limit_gb * 1e9), limit_s, out))
         rounds += 1
     table = Table("format", "cases", *OUTCOMES)
     for name, counts in (*outcomes.items(), ("all", sum(outcomes.values(), Counter[str]()))):
@@ -85,36 +73,36 @@ def fuzz(
     print(f"{rounds} rounds, seeds {seed} to {seed + rounds - 1}")
 
 
-def _in_process(one: Round) -> Counter[str]:
-    """Outcomes of a round in a process of its own."""
+def _in_process(*of_round: Any) -> Counter[str]:
+    """Outcomes of a round (arguments of `_outcomes`) in a process of its own."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context) as pool:
         try:
-            return pool.submit(_outcomes, one).result()
+            return pool.submit(_outcomes, *of_round).result()
         except BrokenProcessPool:
             return Counter(["crash"])
 
 
-def _outcomes(one: Round) -> Counter[str]:
-    """Outcomes of the cases of a round."""
-    format, counts = FORMATS[one.name], Counter[str]()
+def _outcomes(name: str, seed: int, limit_bytes: int, limit_s: int, out: Path) -> Counter[str]:
+    """Outcomes of the cases of a round. Reading may take `limit_bytes` of memory, and a case `limit_s` seconds."""
+    format, counts = FORMATS[name], Counter[str]()
     used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-    resource.setrlimit(resource.RLIMIT_AS, (used + one.limit_bytes, resource.RLIM_INFINITY))
+    resource.setrlimit(resource.RLIMIT_AS, (used + limit_bytes, resource.RLIM_INFINITY))
     signal.signal(signal.SIGALRM, _raise_timeout)
     written = _paths_written_outside()
 
-    @hypothesis.seed(one.seed)
+    @hypothesis.seed(seed)
     @settings(SETTINGS)
     @given(damaged(format.whole))
     def read(content: bytes) -> None:
         written.clear()
-        outcome, error = _outcome(format, content, one.limit_s)
+        outcome, error = _outcome(format, content, limit_s)
         if written and outcome in GOOD:
             outcome, error = "write outside", "\n".join(written)
         counts[outcome] += 1
         if outcome not in GOOD:
-            one.out.mkdir(parents=True, exist_ok=True)
-            stem = one.out / f"{one.name.replace(' ', '-').replace('/', '-')}-{one.seed}-{counts[outcome]}"
+            out.mkdir(parents=True, exist_ok=True)
+            stem = out / f"{name.replace(' ', '-').replace('/', '-')}-{seed}-{counts[outcome]}"
             stem.with_suffix(".bin").write_bytes(content)
             stem.with_suffix(".txt").write_text(f"{outcome}\n{error}")
 

@@ -13,7 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -46,15 +46,6 @@ NUMBERS = (0.0, np.nan, np.inf, 1e30, -1e30, 500.0)
 """Coordinates that a strange point, position or quaternion has."""
 TIMES_S = (-1e10, -3600.03, -5.03, 5.03, 30.03, 3600.03, 1e9)
 """Errors of strange times, in seconds. Times that a message cannot hold become 0."""
-
-
-class Drive(NamedTuple):
-    """Good scans of a run."""
-
-    stamps: np.ndarray
-    poses: np.ndarray
-    damaged: int
-    """Number of damaged messages."""
 
 
 class HostilePublisher:
@@ -173,15 +164,15 @@ def hostile(
         process.join()
         time.sleep(1.0)
         with np.load(sent) as arrays:
-            drive = Drive(arrays["stamps"], arrays["poses"], int(arrays["damaged"]))
+            stamps, poses, damaged = (arrays[key] for key in ("stamps", "poses", "damaged"))
         rows = [_row(node) for node in nodes]
-        loops = [_Loops(node.loops, drive) for node in nodes]
+        loops = [_Loops(node.loops, stamps, poses) for node in nodes]
         for row, ours, others in zip(rows, loops, loops[::-1], strict=True):
             row |= {"loops": len(ours.errors_m), "which the other node has, too": ours.found_by(others)}
             row |= {"wrong loops": int((ours.errors_m > WRONG_M).sum()), "loops of no good scan": ours.unknown}
         warnings = [_warnings(node.log.read_text()) for node in nodes]
     table = Table("", "good messages alone", "with damaged ones")
-    table.add("messages", 2 * count, 2 * count + drive.damaged)
+    table.add("messages", 2 * count, 2 * count + int(damaged))
     for what in rows[0]:
         table.add(what, *(row[what] for row in rows))
     for what in sorted(set().union(*warnings)):
@@ -230,13 +221,13 @@ def _row(node: LiveProcess) -> dict[str, Any]:
 class _Loops:
     """Loops of a node between good scans, with the true poses of the scans."""
 
-    def __init__(self, loops: list[dict], drive: Drive):
+    def __init__(self, loops: list[dict], stamps: np.ndarray, poses: np.ndarray):
         times = np.array([(loop["query_time"], loop["match_time"]) for loop in loops]).reshape(-1, 2)
-        rows = np.searchsorted((drive.stamps[1:] + drive.stamps[:-1]) / 2, times)  # the nearest good scans
-        is_good = (np.abs(drive.stamps[rows] - times) < 1e-3).all(axis=1)
+        rows = np.searchsorted((stamps[1:] + stamps[:-1]) / 2, times)  # the nearest good scans
+        is_good = (np.abs(stamps[rows] - times) < 1e-3).all(axis=1)
         self.unknown = int((~is_good).sum())
         self.times = times[is_good, 0]
-        self.query, self.match = drive.poses[rows[is_good]].swapaxes(0, 1)
+        self.query, self.match = poses[rows[is_good]].swapaxes(0, 1)
         self.found = np.array([loop["match_from_query"] for loop in loops]).reshape(-1, 4, 4)[is_good]
         self.errors_m = np.linalg.norm((inverse(self.found) @ inverse(self.match) @ self.query)[:, :3, 3], axis=1)
 

@@ -219,6 +219,9 @@ def training(
             config = configured(load_preset(name), type_)
             timing = Timing(repeats, steps, size)
             row = measured(lambda config=config: step_work(config, steps, labels=labels), type_, timing)
+            if "error" in row:  # such as no memory
+                table.add(name, type_, config.tuples, row["error"], *[""] * (len(columns) - 1))
+                continue
             giga = (row[key] / 1e9 for key in ("flop", "flop_per_second", "peak_flop_per_second"))
             numbers = (config.tuples / row["seconds"], row["images_per_second"], *giga)
             spread = " to ".join(f"{share:.3f}" for share in row["share_of_peak_spread"])

@@ -119,11 +119,11 @@ def _train_missing(reproduction: "Reproduction", plan: "Plan") -> None:
 
 def _write_results(reproduction: "Reproduction", names: list[str]) -> None:
     """Compute, write and print the tables and figures with these names (`table1`, `figure5`) from finished runs."""
-    from sglpr_jax.reproduce.figures import write_figures
+    from sglpr_jax.reproduce.figures import FIGURES, write_figures
     from sglpr_jax.reproduce.tables import write_tables
 
     for name in names:
-        if EXPERIMENTS[name].kind == "figure":
+        if name in FIGURES:
             for path in write_figures(reproduction, name):
                 print(f"written: {path}")
         else:

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
 
@@ -32,9 +32,8 @@ VARIANTS: dict[str, Mapping[str, Any]] = {
 
 @dataclass(frozen=True)
 class Experiment:
-    """A table or figure of the paper: its content and the variants that it compares."""
+    """A table or figure of the paper: its title and the variants that it compares."""
 
-    kind: Literal["table", "figure"]
     title: str
     variants: Mapping[str, str] = field(default_factory=lambda: {FULL: "SG-LPR"})
     """Label of each variant in this experiment, by the variant's name."""
@@ -52,9 +51,8 @@ class Experiment:
 
 
 EXPERIMENTS: dict[str, Experiment] = {
-    "table1": Experiment("table", "F1max beside other methods", beside_handcrafted=True, protocols=(TOP1, PAIRS)),
+    "table1": Experiment("F1max beside other methods", beside_handcrafted=True, protocols=(TOP1, PAIRS)),
     "table2": Experiment(
-        "table",
         "F1max, every scan rotated",
         {FULL: "SG-LPR", "no-rotation": "SG-LPR, not rotated in training"},
         rotated=True,
@@ -62,21 +60,16 @@ EXPERIMENTS: dict[str, Experiment] = {
         protocols=(TOP1, PAIRS),
     ),
     "table3": Experiment(
-        "table",
         "Recall@1 across NCLT sessions, trained on other recordings",
         beside_handcrafted=True,
         across_sessions=True,
     ),
     "table4": Experiment(
-        "table",
         "CBAM and NetVLAD",
         {"convolutions": "convolutions", "no-cbam": "convolutions, NetVLAD", FULL: "convolutions, CBAM, NetVLAD"},
     ),
-    "table5": Experiment(
-        "table", "The segmentation branch", {NO_SEGMENTATION: "without", FULL: "with"}, needs_labels=True
-    ),
+    "table5": Experiment("The segmentation branch", {NO_SEGMENTATION: "without", FULL: "with"}, needs_labels=True),
     "table6": Experiment(
-        "table",
         "Input of the place head",
         {
             "counts": "RB: counts",
@@ -87,7 +80,6 @@ EXPERIMENTS: dict[str, Experiment] = {
         needs_labels=True,
     ),
     "table7": Experiment(
-        "table",
         "Terms of the loss",
         {
             NO_SEGMENTATION: "triplet",
@@ -97,18 +89,16 @@ EXPERIMENTS: dict[str, Experiment] = {
         },
         needs_labels=True,
     ),
-    "figure5": Experiment("figure", "Precision and recall", beside_handcrafted=True),
-    "figure6": Experiment("figure", "Top-1 retrieval along the trajectory"),
-    "figure7": Experiment("figure", "Counts, true and predicted semantic maps", needs_labels=True),
+    "figure5": Experiment("Precision and recall", beside_handcrafted=True),
+    "figure6": Experiment("Top-1 retrieval along the trajectory"),
+    "figure7": Experiment("Counts, true and predicted semantic maps", needs_labels=True),
     "figure8": Experiment(
-        "figure",
         "Feature heat maps with and without the segmentation branch",
         {FULL: "with", NO_SEGMENTATION: "without"},
         across_sessions=True,
         needs_labels=True,
     ),
     "figure9": Experiment(
-        "figure",
         "Number of semantic categories",
         {
             NO_SEGMENTATION: "0",
@@ -121,7 +111,6 @@ EXPERIMENTS: dict[str, Experiment] = {
         needs_labels=True,
     ),
     "normalisation": Experiment(
-        "table",
         "Point counts as input (not in the paper)",
         {"raw-counts": "n", "clipped-counts": "min(n, 10) / 10", FULL: "log(1 + n)"},
     ),

@@ -172,4 +172,4 @@ def recall_at_1(
         in_database = np.arange(ends.max())[None] < ends[:, None]  # (query, frame)
         nearest = np.where(in_database, distances, np.inf).argmin(axis=1)
         hits += int((np.linalg.norm(plane[block] - plane[nearest], axis=1) <= FOUND_M).sum())
-    return hits / len(queries)
+    return hits / len(queries) if len(queries) else np.nan
