@@ -81,8 +81,8 @@ class Describer:
         try:
             with local_copy(row["source"]) as path:
                 recording = sglpr_jax.open_recording(path)
-                stored = embed_to_store(self.out, self.method, recording, site=self.site, source=row["source"])
-            return row | {"address": stored.address, "added": stored.added or 0, "error": ""}
+                address, added = embed_to_store(self.out, self.method, recording, site=self.site, source=row["source"])
+            return row | {"address": address, "added": added or 0, "error": ""}
         except (OSError, ValueError) as error:
             return row | {"address": "", "added": 0, "error": str(error)}
 

@@ -104,11 +104,11 @@ def embed_recording(command: EmbedCommand) -> None:
         }
         if writes_store:
             origin = {"site": command.site, "source": str(command.data.absolute())}
-            stored = embed_to_store(command.target, method, recording, **origin, **options)
+            address, added = embed_to_store(command.target, method, recording, **origin, **options)
         else:
             file = embed(method, recording, **options)
     if writes_store:
-        print(f"{stored.address}: {'already there' if stored.added is None else f'{stored.added} places'}")
+        print(f"{address}: {'already there' if added is None else f'{added} places'}")
         return
     file.save(Path(command.target))
     skipped = len(recording) - len(file)

@@ -21,10 +21,9 @@ if TYPE_CHECKING:
     from sglpr_jax.data.recording import Recording
     from sglpr_jax.training.recipe import TrainResult
 
-SETTINGS = ("seq", "data", "also", "pseudo_labels", "preset", "weights", "train_seq", "pose_source")
+SETTINGS = ("seq", "data", "also", "pseudo_labels", "preset", "weights", "train_seq", "pose_source", "format",
+            "sensor_height", "skip_bad")  # fmt: skip
 """Flags that must be equal in a resumed run, beside its configuration."""
-NEWER_SETTINGS = ("format", "sensor_height", "skip_bad")
-"""More flags of this kind, which older runs do not know. They are stored only if they differ from their defaults."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,8 +115,7 @@ def run_folder(command: TrainCommand) -> Path:
 
 def settings(command: TrainCommand) -> dict[str, object]:
     """Return the flags that the run stores in config.json beside its configuration, by name."""
-    newer = [name for name in NEWER_SETTINGS if getattr(command, name) != getattr(TrainCommand, name)]
-    return {name: getattr(command, name) for name in (*SETTINGS, *newer)}
+    return {name: getattr(command, name) for name in SETTINGS}
 
 
 def _train(

@@ -11,7 +11,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.core import DDSException, InstanceState, Policy, Qos, ReadCondition, SampleState, ViewState, WaitSet
@@ -44,16 +44,6 @@ _BASE_TYPES = {"bool": bool, "byte": types.uint8, "octet": types.uint8, "char": 
 }
 
 
-class _Reader(NamedTuple):
-    """A subscription to one type of a topic. `receive` takes its messages, and at most `depth` of them wait."""
-
-    kind: str
-    reader: DataReader
-    condition: ReadCondition
-    receive: Receive
-    depth: int
-
-
 class DdsTransport:
     """Participant of a DDS domain. A thread takes the messages. See `ros_topics.Transport`."""
 
@@ -72,10 +62,11 @@ class DdsTransport:
         self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         self._waiting = WaitSet(self._participant)
         self._topics: dict[tuple[str, str], Topic] = {}
-        self._readers: list[_Reader] = []
+        self._deliveries: list[Callable[[], None]] = []
+        """Functions that pass the new messages of a reader to its `receive`."""
         self._writers: dict[tuple[str, str], DataWriter] = {}
-        self._qos_statuses: list[tuple[str, Callable[[], Any]]] = []
-        """Report of each topic, and function that returns the status of its QoS mismatches."""
+        self._qos_statuses: dict[str, Callable[[], Any]] = {}
+        """Function that returns the status of the QoS mismatches of a topic, by their report."""
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="dds", daemon=True)
         self._thread.start()
@@ -88,16 +79,16 @@ class DdsTransport:
         for kind in kinds:
             reader = DataReader(self._participant, self._topic(topic, kind), qos=qos)
             condition = ReadCondition(reader, ViewState.Any | InstanceState.Any | SampleState.NotRead)
-            self._readers.append(_Reader(kind, reader, condition, receive, depth))
+            self._deliveries.append(functools.partial(self._deliver, kind, reader, condition, receive, depth))
             self._waiting.attach(condition)
-        self._qos_statuses.append((mismatch, self._readers[-1].reader.get_requested_incompatible_qos_status))
+            self._qos_statuses[mismatch] = reader.get_requested_incompatible_qos_status
 
     def advertise(self, topic: str, kind: str, *, depth: int, latched: bool) -> Callable[[bytes], None]:
         qos = _qos(depth, reliable=True, latched=latched)
         writer = DataWriter(self._participant, self._topic(topic, kind), qos=qos)
         expected = f"{topic}: expected subscribers that accept the QoS {_qos_text(True, latched)}"
         mismatch = f"{expected}, found one that asks for more"
-        self._qos_statuses.append((mismatch, writer.get_offered_incompatible_qos_status))
+        self._qos_statuses[mismatch] = writer.get_offered_incompatible_qos_status
         self._writers[topic, kind] = writer
         del writer  # held by the dictionary alone, so that `close` deletes it
 
@@ -121,7 +112,7 @@ class DdsTransport:
     def close(self) -> None:
         self._closed.set()
         self._thread.join()
-        for entities in (self._qos_statuses, self._readers, self._writers, self._topics):
+        for entities in (self._qos_statuses, self._deliveries, self._writers, self._topics):
             entities.clear()
         del self._waiting, self._publications, self._participant
 
@@ -134,26 +125,26 @@ class DdsTransport:
         """Deliver messages, and check the QoS regularly, until the transport is closed. Runs in its own thread."""
         checked_at = time.monotonic()
         while not self._closed.is_set():
-            if self._readers:
+            if self._deliveries:
                 self._waiting.wait(duration(milliseconds=100))
             else:  # without readers, the wait of cyclonedds returns at once, and this loop would use a core
                 self._closed.wait(0.1)
-            for reader in tuple(self._readers):
-                self._deliver(reader)
+            for deliver in tuple(self._deliveries):
+                deliver()
             if time.monotonic() - checked_at > QOS_CHECK_S:
                 checked_at = time.monotonic()
                 self._report_qos_mismatches()
 
-    def _deliver(self, source: _Reader) -> None:
-        """Pass the new messages of a reader to its `receive`."""
+    def _deliver(self, kind: str, reader: DataReader, condition: ReadCondition, receive: Receive, depth: int) -> None:
+        """Pass the new messages of a reader to `receive`, at most `depth` of them."""
         samples = list[Any]()
-        with self._reporting(source.kind):
-            samples = source.reader.take(N=source.depth, condition=source.condition)
+        with self._reporting(kind):
+            samples = reader.take(N=depth, condition=condition)
         for sample in samples:
-            with self._reporting(source.kind):
+            with self._reporting(kind):
                 if sample.sample_info.valid_data:
                     publisher = sample.sample_info.publication_handle
-                    source.receive(Received(source.kind, sample.cdr, publisher, time.monotonic()))
+                    receive(Received(kind, sample.cdr, publisher, time.monotonic()))
 
     @contextlib.contextmanager
     def _reporting(self, kind: str) -> Iterator[None]:
@@ -165,7 +156,7 @@ class DdsTransport:
 
     def _report_qos_mismatches(self) -> None:
         """Report each new publisher or subscriber whose QoS does not fit."""
-        for text, qos_status in tuple(self._qos_statuses):
+        for text, qos_status in tuple(self._qos_statuses.items()):
             mismatch = qos_status()
             if mismatch.total_count_change > 0 and mismatch.last_policy_id != TYPE_POLICY:
                 policy = POLICIES.get(mismatch.last_policy_id, f"policy {mismatch.last_policy_id}")

@@ -28,8 +28,6 @@ from sglpr_jax.pose_graph.files import loop_lines, read_loops_jsonl
 from sglpr_jax.pose_graph.incremental import IncrementalTrajectory
 
 FRAMES_LOG, LOOPS_FILE = "frames.log", "loops.jsonl"
-OLD_FILES = ("journal.bin", "settings.json")
-"""Files by which a map of an earlier version is recognised. Such maps cannot be read."""
 SYNC_S = 5.0
 """Time after which new scans are forced to the disk, in seconds. A loss of power costs at most these scans."""
 MAX_PAUSE_S = 1e8
@@ -112,7 +110,6 @@ class LiveMap:
         self._continuity = OdometryContinuity(report, expected=expects_odometry)
         self._mounting = FixedMounting(sensor_height)
         about = {"format": FRAME_FORMAT, "weights": detector.finder.index.weights_hash, "sensor_height": sensor_height}
-        _check_version(folder)
         settings = {**about, **dataclasses.asdict(detector.config)}
         self._log: FrameLog | None = FrameLog(folder / FRAMES_LOG, settings)
         self._loops_path, self._loops_file = folder / LOOPS_FILE, -1
@@ -347,15 +344,6 @@ class LiveMap:
             latency_s=time.monotonic() - received,
             odometry_frame=int(latest),
         )
-
-
-def _check_version(folder: Path) -> None:
-    """Raise ValueError if a folder has the map of an earlier version."""
-    for name in OLD_FILES:
-        if (folder / name).exists():
-            raise ValueError(
-                f"{folder}: expected a map of this version, found {name} of an earlier one; use another --out"
-            )
 
 
 def _missing(loops: list[LoopClosure], written: list[LoopClosure]) -> list[LoopClosure]:

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from sglpr_jax.files import write_all
-from sglpr_jax.live.live_map import LOOPS_FILE, LiveMap
-from sglpr_jax.pose_graph.files import write_loops_jsonl, write_tum
+from sglpr_jax.live.live_map import LiveMap
+from sglpr_jax.pose_graph.files import write_tum
 from sglpr_jax.pose_graph.folder import graph_files
 
 TRAJECTORY, CORRECTED = "trajectory.tum", "trajectory-optimized.tum"
@@ -28,10 +28,7 @@ def write_results(live: LiveMap, folder: Path) -> list[Path]:
         segment_starts = np.flatnonzero(np.diff(detector.finder.segments_of(scans))) + 1  # where the motion is unknown
         segments = np.split(scans, segment_starts)
         chains = [(frames, odometry[frames], detector.config.drift) for frames in segments]
-    loops = live.loops
-    rejected = [*detector.rejected, *detector.undecided()]
-    files = graph_files(loops, rejected, chains)
-    files[LOOPS_FILE] = partial(write_loops_jsonl, loops=loops)
+    files = graph_files(live.loops, [*detector.rejected, *detector.undecided()], chains)
     if len(odometry):
         files[TRAJECTORY] = partial(write_tum, poses=odometry, times=live.stamps)
         if live.trajectory is not None:

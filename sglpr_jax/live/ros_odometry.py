@@ -64,7 +64,8 @@ class LiveOdometry:
         content = RosMessage(message.raw, cdr=True)
         poses = read_transforms(content) if message.kind == TRANSFORMS else [POSES[message.kind](content)]
         with self._changed:
-            for frames, pose in map(_with_frame_names, poses):
+            for pose in poses:
+                frames = pose.frame, pose.child
                 if self._chosen is not None and frames != self._chosen[0]:
                     continue
                 if not pose.is_valid:
@@ -97,7 +98,7 @@ class LiveOdometry:
         """Add the transforms of a message of /tf_static."""
         with self._changed:
             transforms = read_transforms(RosMessage(message.raw, cdr=True))
-            self._static |= (_with_frame_names(pose) for pose in transforms if pose.is_valid)
+            self._static |= {(pose.frame, pose.child): pose for pose in transforms if pose.is_valid}
 
     def pose(self, time: float, lidar: str, *, wait_s: float) -> Float[np.ndarray, "4 4"] | None:
         """Return the pose of the LiDAR at the time of a scan, or None with a report if it is unknown.
@@ -158,12 +159,6 @@ class LiveOdometry:
             return f"poses of {children}, which tf does not connect to {lidar} rigidly"
         stamps = [pose.time for pose in self._poses[self._chosen[0]]]
         return f"poses from {min(stamps):.3f} to {max(stamps):.3f}"
-
-
-def _with_frame_names(pose: StampedPose) -> tuple[FrameNames, StampedPose]:
-    """Return the frames of a pose, without slashes at the ends of their names, and the pose with these names."""
-    pose = pose._replace(child=pose.child.strip("/"), frame=pose.frame.strip("/"))
-    return (pose.frame, pose.child), pose
 
 
 def _can_follow(last: StampedPose, pose: StampedPose) -> bool:

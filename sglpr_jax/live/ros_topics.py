@@ -141,7 +141,7 @@ class RosSource:
             self._late = header.time
             found = f"found one {self._last - header.time:.1f} s before the last one; its pose is unknown"
             return self._report("order", f"{self.topic}: expected scans in order, {found}")
-        pose = odometry.pose(header.time, header.frame.strip("/"), wait_s=WAIT_S)
+        pose = odometry.pose(header.time, header.frame, wait_s=WAIT_S)
         self._last = self._last if pose is None else header.time
         return pose
 

@@ -138,7 +138,7 @@ def add_scans(
     finder: CandidateSearch,
     add: Callable[[Keyframe | None, Fits | None], object],
     *,
-    rows: Iterator[int],
+    is_due: Callable[[int], bool],
     kept_in: Path | str | None,
     on_bad_scan: OnBadScan | None,
     should_stop: Callable[[], bool],
@@ -152,7 +152,7 @@ def add_scans(
       finder: Candidate search without frames.
       add: Function that adds the next frame to the finder. It receives the keyframe, or None for a bad scan, and the
         comparisons of a frame of the checkpoint, or None for a new frame.
-      rows: Rows of the scans that the checkpoint lacks. A row is taken after the previous scan was added.
+      is_due: Whether the scan in a row is the next frame, after all earlier frames were added. Others are skipped.
       kept_in: Checkpoint directory, or None.
       on_bad_scan: Called with id and error of a bad scan. Without it, the error is raised, and a bad scan of the
         checkpoint is read again.
@@ -169,6 +169,12 @@ def add_scans(
         )
     with FrameLog(path, {} if path is None else settings(recording, finder, **arguments), restarts=True) as log:
 
+        def next_row() -> int | None:
+            """Row of the next frame, or None at the end. Skips the scans before it."""
+            while finder.scans < len(recording) and not is_due(finder.scans):
+                finder.skip()
+            return finder.scans if finder.scans < len(recording) else None
+
         def rows_to_read() -> Iterator[int]:
             """Add the frames that the checkpoint has next, and then yield a row."""
             while True:
@@ -178,11 +184,11 @@ def add_scans(
                     is_other = about["missing"] != len(finder.missing)  # other scans before it could be read
                     if is_other or (keyframe is None and on_bad_scan is None):
                         break
+                    next_row()  # the checkpoint has only frames
                     add(keyframe, fits)
                 if len(finder) > before:
                     on_progress(finder.scans)
-                row = next(rows, None)
-                if row is None:
+                if (row := next_row()) is None:
                     return
                 yield row
 

@@ -115,7 +115,13 @@ def find_loops(
     for recording in all_recordings:
         check_is(recording, Recording, by="open_recording")
     registered = not any(one.has_images for one in all_recordings) if registered is None else registered
-    inputs = [_check_input(*pair, registered=registered) for pair in zip(all_recordings, all_odometry, strict=True)]
+    inputs = list[tuple[Recording, Float[np.ndarray, "n 4 4"] | None]]()
+    for recording, given in zip(all_recordings, all_odometry, strict=True):
+        poses = None if given is None else as_scan_poses(given, recording, of="odometry")
+        if registered:
+            recording.require_scans("scans to register")
+        # With odometry, scans of a sensor that tilts are levelled.
+        inputs.append((recording if poses is None else with_odometry(recording, poses), poses))
     finished_steps, searched = 0, list[SearchedSession]()
     loops, rejected, transforms = list[LoopClosure](), list[RejectedClosure](), list[SegmentAlignment]()
 
@@ -161,18 +167,6 @@ def find_loops(
         scale=scale,
         stopped=len(inputs) > 1 and should_stop(),
     )
-
-
-def _check_input(
-    recording: Recording, odometry: ArrayLike | None, *, registered: bool
-) -> tuple[Recording, Float[np.ndarray, "n 4 4"] | None]:
-    """Check a recording and its odometry before any work. Returns the recording with its odometry, and the poses."""
-    poses = None if odometry is None else as_scan_poses(odometry, recording, of="odometry")
-    if registered:
-        recording.require_scans("scans to register")
-    if poses is not None:
-        recording = with_odometry(recording, poses)  # levels the scans of a sensor that tilts
-    return recording, poses
 
 
 def _session_in_metres(
@@ -221,16 +215,7 @@ def _search_session(
         time = None if recording.times is None else float(recording.times[row])
         return {"time": time, "odometry": None if odometry is None else odometry[row]}
 
-    def next_keyframe() -> int | None:
-        """Row of the next keyframe, or None at the end. Skips the scans before it."""
-        while finder.scans < len(recording):
-            if finder.is_due(**at(finder.scans)):
-                return finder.scans
-            finder.skip()
-        return None
-
     def add(keyframe: Keyframe | None, fits: Fits | None) -> None:
-        next_keyframe()  # a checkpoint has only keyframes
         detector.add_keyframe(keyframe, fits=fits, **at(finder.scans))
 
     # With a limit of places, loops decide which scans are stored. A checkpoint then depends on settings and model, too.
@@ -241,7 +226,7 @@ def _search_session(
         recording,
         finder,
         add,
-        rows=iter(next_keyframe, None),
+        is_due=lambda row: finder.is_due(**at(row)),
         kept_in=kept_in,
         odometry=odometry,
         keyframe_m=config.keyframe_m,

@@ -1,6 +1,6 @@
 """Creation of a `PlaceMap` from a recording with known poses. A run can skip unreadable scans, stop and resume."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -69,35 +69,23 @@ def map_recording(
     poses = as_scan_poses(poses, recording, of="poses")
     recording = with_odometry(recording, poses)
     finder = CandidateSearch(params)  # describes the scans; each scan that is read becomes one of its frames
-    keyframes: list[Keyframe | None] = []  # keyframe of each frame. None for an unreadable scan.
-    frame_rows: list[int] = []  # row in the recording of each frame
-    places: list[tuple[int, int]] = []  # frame and row of each place
-    done = 0  # number of processed rows of the recording
+    places: list[tuple[int, Keyframe]] = []  # row in the recording and keyframe of each place
 
-    def rows_to_read() -> Iterator[int]:
-        """Yield the rows at least `spacing_m` from the last place. The caller adds each to `finder` before the next."""
-        nonlocal done
-        for done in range(len(poses)):
-            if places and np.linalg.norm(poses[done, :3, 3] - poses[places[-1][1], :3, 3]) < spacing_m:
-                continue
-            frame = len(frame_rows)
-            if frame == len(finder):  # otherwise the frame is in the checkpoint of an earlier run
-                yield done
-            if not finder.empty[frame]:
-                places.append((frame, done))
-            frame_rows.append(done)
-        done = len(poses)
+    def is_due(row: int) -> bool:
+        """Whether a scan is at least `spacing_m` from the last place."""
+        return not places or bool(np.linalg.norm(poses[row, :3, 3] - poses[places[-1][0], :3, 3]) >= spacing_m)
 
     def add(keyframe: Keyframe | None, fits: Fits | None) -> None:
         """Add a frame without comparing it with earlier ones: a map needs no loops."""
-        keyframes.append(keyframe)
         finder.add_keyframe(keyframe, fits=NO_FITS)
+        if keyframe is not None and not finder.empty[-1]:
+            places.append((int(finder.rows[-1]), keyframe))
 
     add_scans(
         scaled(recording, scale),
         finder,
         add,
-        rows=rows_to_read(),
+        is_due=is_due,
         kept_in=kept_in,
         on_bad_scan=on_bad_scan,
         should_stop=should_stop,
@@ -105,26 +93,21 @@ def map_recording(
         poses=poses,
         spacing_m=spacing_m,
     )
-    on_progress(done)
-    if not places and done == len(recording):
+    on_progress(finder.scans)
+    if not places and finder.scans == len(recording):
         raise ValueError(
             f"{recording.name}: expected at least one scan that is not empty, found {len(recording)} empty ones"
         )
-    skipped = tuple(recording.ids[frame_rows[frame]] for frame in finder.missing)
+    skipped = tuple(recording.ids[row] for row in finder.rows[finder.missing])
     index = Index.empty(finder.index.width, weights_hash=finder.index.weights_hash, scale=scale)
-    place_keyframes = [keyframe for frame, _ in places if (keyframe := keyframes[frame]) is not None]
-    rows = [row for _, row in places]
-    return MapBuildResult(_place_map(index, recording, poses, rows, place_keyframes), done, skipped)
+    return MapBuildResult(_place_map(index, recording, poses, places), finder.scans, skipped)
 
 
 def _place_map(
-    index: Index,
-    recording: Recording,
-    poses: Float[np.ndarray, "n 4 4"],
-    rows: Sequence[int],
-    keyframes: Sequence[Keyframe],
+    index: Index, recording: Recording, poses: Float[np.ndarray, "n 4 4"], places: Sequence[tuple[int, Keyframe]]
 ) -> PlaceMap:
-    """Return the map of the scans in `rows` of a recording, given their keyframes. `index` is empty and is filled."""
+    """Return the map of `places`, rows of a recording and their keyframes. `index` is empty and is filled."""
+    rows, keyframes = [row for row, _ in places], [keyframe for _, keyframe in places]
     names = place_names(recording)
     descriptors = np.array([keyframe.descriptor for keyframe in keyframes], np.float32).reshape(-1, index.width)
     index.add(descriptors, ids=[names[row] for row in rows], positions=poses[rows, :3, 3])

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -36,19 +36,9 @@ have more, scans of other places mostly less."""
 
 RESULT_NUMBERS = 16 + 3
 """Numbers of a scan in the log: its pose, the time of its last point relative to the scan in seconds, its number of
-points (NaN if it is unreadable), and its overlap (`_RegisteredScan`)."""
+points (NaN if it is unreadable), and its overlap (`_FrontEnd.add`)."""
 Cloud = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " m"]]
 """Points of a scan in metres, and the time of each point relative to the scan in seconds or an empty array."""
-
-
-class _RegisteredScan(NamedTuple):
-    """Pose of a scan, and the quality of its registration."""
-
-    pose: Float[np.ndarray, "4 4"]
-    points: int
-    """Number of points after downsampling."""
-    overlap: float
-    """Share of points with a point of the previous scans within a voxel. 1 for the first scans."""
 
 
 def scan_odometry(
@@ -147,18 +137,20 @@ class _FrontEnd:
     """kiss-icp, to which scans are added one after the other."""
 
     def __init__(self, config: OdometryConfig):
-        library = _library()
         data = {"max_range": config.max_range_m, "min_range": config.min_range_m, "deskew": True}
         mapping = {"voxel_size": config.used_voxel_m}
         settings = importlib.import_module("kiss_icp.config").KISSConfig(data=data, mapping=mapping)
-        self._icp, self._voxel_m = library.KissICP(settings), config.used_voxel_m
+        self._icp, self._voxel_m = check_installed().KissICP(settings), config.used_voxel_m
         self._previous_clouds: deque[Float[np.ndarray, "n 3"]] = deque(maxlen=PREVIOUS)
         """Points of the previous scans in the frame of the first scan."""
 
-    def add(self, cloud: Cloud | None, *, known_pose: Float[np.ndarray, "4 4"] | None = None) -> _RegisteredScan:
+    def add(
+        self, cloud: Cloud | None, *, known_pose: Float[np.ndarray, "4 4"] | None = None
+    ) -> tuple[Float[np.ndarray, "4 4"], int, float]:
         """Register the next scan, or add it at its known pose. Without a scan or with few points, extrapolate.
 
-        These are the steps of kiss-icp's `register_frame`, which takes no known pose.
+        These are the steps of kiss-icp's `register_frame`, which takes no known pose. Returns the pose, the number of
+        points after downsampling, and the result of `_overlap`.
         """
         icp, guess = self._icp, self._icp.last_pose @ self._icp.last_delta
         source, mapped = np.zeros((0, 3)), np.zeros((0, 3))
@@ -166,7 +158,7 @@ class _FrontEnd:
             source, mapped = icp.voxelize(icp.preprocessor.preprocess(*cloud, icp.last_delta))
         if len(source) < MIN_POINTS:
             icp.last_pose = guess
-            return _RegisteredScan(guess, len(source), 1.0)
+            return guess, len(source), 1.0
         pose = known_pose
         if pose is None:
             sigma = icp.adaptive_threshold.get_threshold()
@@ -181,7 +173,7 @@ class _FrontEnd:
         icp.local_map.update(mapped, pose)
         icp.last_delta = np.linalg.inv(icp.last_pose) @ pose
         icp.last_pose = pose
-        return _RegisteredScan(pose, len(source), self._overlap(source, mapped, pose))
+        return pose, len(source), self._overlap(source, mapped, pose)
 
     def _overlap(self, source: np.ndarray, mapped: np.ndarray, pose: np.ndarray) -> float:
         """Share of `source` with a point of the previous scans within a voxel. 1 for the first scans.
@@ -252,10 +244,6 @@ def describe_odometry(recording: Recording, config: OdometryConfig, *, scale: Sc
     )
 
 
-def check_installed() -> None:
-    """Raise ImportError if kiss-icp is not installed."""
-    _library()
-
-
-def _library() -> ModuleType:
+def check_installed() -> ModuleType:
+    """Import kiss-icp. Raises ImportError if it is not installed."""
     return optional_module("kiss_icp.kiss_icp", "odometry from scans", extra="odometry")

@@ -59,18 +59,24 @@ def write_loop_folder(
     folder, names, numbers, placed = Path(folder), result.unique_names, vertex_numbers(result), placements(result)
     ids, recordings = dict[int, str](), dict[int, str]()  # by vertex number
     chains = []  # vertex numbers, poses and drift of each session with odometry
-    for name, vertices, (_, group_from_session), session in zip(names, numbers, placed, result.sessions, strict=True):
+    comments = []  # vertex numbers and frame of each session, if there are several
+    for name, vertices, (group, group_from_session), session in zip(
+        names, numbers, placed, result.sessions, strict=True
+    ):
         ids |= zip(vertices.tolist(), session.recording.ids, strict=True)
         recordings |= dict.fromkeys(vertices.tolist(), name)
+        frame = ""
         if session.odometry is not None:
             poses = group_from_session @ session.odometry[: session.frames]
             chains.append((vertices[: session.frames], poses, session.drift))
-    named: dict[str, Any] = {"ids": ids, "recordings": recordings if len(names) > 1 else None}
+            frame = f"; poses in the frame of {names[group]}"
+        if len(names) > 1:
+            offset = vertices[0] - session.recording.numbers[0]
+            comments.append(f"{name}: vertex = {offset} + number of the scan{frame}")
     loops = [renumbered(loop, numbers) for loop in result.loops]
     rejected = convert_rejected(result.rejected, lambda loop: renumbered(loop, numbers))
-    comments = _comments(result, names, numbers) if len(names) > 1 else []
-    files = graph_files(loops, rejected, chains, comments=comments, **named)
-    files[LOOPS_JSONL] = partial(write_loops_jsonl, loops=loops, **named)
+    named_recordings = recordings if len(names) > 1 else None
+    files = graph_files(loops, rejected, chains, comments=comments, ids=ids, recordings=named_recordings)
     if len(names) > 1:
         files[FRAMES] = partial(write_json, value=_frames_json(result, names, numbers))
     files |= _trajectory_files(result, names, optimized)
@@ -93,12 +99,13 @@ def graph_files(
     ids: Ids | None = None,
     recordings: Ids | None = None,
 ) -> Writers:
-    """Return writers of the graph (g2o), the table of loops (csv) and the rejected pairs (JSON lines). `chains`
-    and `comments` are arguments of `write_g2o`, `ids` and `recordings` of `loop_lines`."""
+    """Return writers of the graph (g2o), the table of loops (csv), the rejected pairs and the loops (JSON lines).
+    `chains` and `comments` are arguments of `write_g2o`, `ids` and `recordings` of `loop_lines`."""
     return {
         LOOPS_G2O: partial(write_g2o, loops=loops, chains=chains, comments=comments),
         LOOPS_CSV: partial(write_loops_csv, loops=loops, recordings=recordings),
         REJECTED: partial(write_loops_jsonl, loops=rejected, ids=ids, recordings=recordings),
+        LOOPS_JSONL: partial(write_loops_jsonl, loops=loops, ids=ids, recordings=recordings),
     }
 
 
@@ -147,16 +154,6 @@ def _frames_json(
         [names[match], names[query]] for match, query in result.pairs if not result.between(match, query).transforms
     ]
     return {"recordings": recordings, "transforms": transforms, "no_common_place": no_common_place}
-
-
-def _comments(result: LoopSearchResult, names: Sequence[str], numbers: Sequence[Int[np.ndarray, " _"]]) -> list[str]:
-    """Return comment lines that state the vertex numbers and the frame of each session."""
-    lines = []
-    for name, vertices, (group, _), session in zip(names, numbers, placements(result), result.sessions, strict=True):
-        offset = int(vertices[0] - session.recording.numbers[0])
-        frame = f"; poses in the frame of {names[group]}" if session.odometry is not None else ""
-        lines.append(f"{name}: vertex = {offset} + number of the scan{frame}")
-    return lines
 
 
 def _trajectory_files(result: LoopSearchResult, names: Sequence[str], optimized: OptimizedTrajectory | None) -> Writers:

@@ -16,8 +16,8 @@ from sglpr_jax.numpy_files import read_arrays
 from sglpr_jax.retrieval.distances import distance_function
 from sglpr_jax.schema import Column, check_about, check_columns
 
-FORMAT, FORMAT_1 = "sglpr-jax descriptors 2", "sglpr-jax descriptors 1"
-"""Format in every file, and an older one without a distance, whose descriptors are compared by L2."""
+FORMAT = "sglpr-jax descriptors 2"
+"""Format in every file."""
 SKIPPED = "skipped"
 """Key of `config` for the rows of a recording that were skipped."""
 REQUIRED = ("about", "ids", "descriptors")
@@ -125,8 +125,13 @@ class DescriptorFile:
         arrays = read_arrays(path, expected="a descriptor file (.npz)")
         if not set(REQUIRED) <= set(arrays):
             raise ValueError(f"{path}: expected arrays {', '.join(REQUIRED)}; found {', '.join(arrays) or 'none'}")
-        about, ids = _read_about(path, arrays["about"]), arrays["ids"]
+        text, ids = arrays["about"], arrays["ids"]
         with naming(path):
+            if text.ndim != 0 or text.dtype.kind != "U":
+                raise ValueError(f"expected JSON in `about`, found an array {text.dtype} {text.shape}")
+            about = parse_json(str(text), source="`about`")
+            check_about(about, ABOUT, format=FORMAT)
+            distance_function(about["distance"])
             if ids.ndim != 1 or ids.dtype.kind != "U":
                 raise ValueError(f"expected ids as an array (n,) of strings, found {ids.dtype} {ids.shape}")
             return cls(
@@ -171,16 +176,3 @@ def check_same_method(a: DescriptorFile, b: DescriptorFile) -> None:
         }
 
     check_made_alike(properties(a), properties(b), of=f"descriptors of {b.sequence}, as those of {a.sequence},")
-
-
-def _read_about(path: Path, text: np.ndarray) -> dict[str, Any]:
-    """Parse the array `about` of a file (`ABOUT`). Raises ValueError if another program or version wrote it."""
-    if text.ndim != 0 or text.dtype.kind != "U":
-        raise ValueError(f"{path}: expected JSON in `about`, found an array {text.dtype} {text.shape}")
-    about = parse_json(str(text), source=f"{path}, `about`")
-    if isinstance(about, dict) and about.get("format") == FORMAT_1:
-        about = {"distance": "l2", **about, "format": FORMAT}
-    with naming(path):
-        check_about(about, ABOUT, format=FORMAT)
-        distance_function(about["distance"])
-    return about

@@ -71,14 +71,13 @@ class Index:
     ids: list[str]
     """Names of the places."""
     _columns: dict[str, GrowingArray]
-    _lengths: GrowingArray = dataclasses.field(
-        default_factory=lambda: GrowingArray(np.empty(0, np.float32)), repr=False
-    )
-    """Squared length of each descriptor. Places added since the last query are missing."""
     scale: Scale = 1
     """Scale of the described scans (`data.scaled`)."""
     _last_query: tuple[bytes, Float[np.ndarray, "1 n"]] | None = dataclasses.field(default=None, repr=False)
     """Bytes of the last single query, and the result of `_relative_squared_distances`. None after places change."""
+
+    def __post_init__(self):
+        self._lengths = GrowingArray(_squared_lengths(self.descriptors))
 
     @classmethod
     def empty(cls, width: int = 256, *, weights_hash: str = "", distance: str = "l2", scale: Scale = 1) -> "Index":
@@ -161,19 +160,21 @@ class Index:
             new_columns["times"] = _finite_array("times", np.reshape(times, -1), (n,))
         if positions is not None:
             new_columns["positions"] = _finite_array("positions", np.reshape(positions, (-1, 3)), (n, 3))
-        if len(self) and set(new_columns) != set(self._columns):
+        if not len(self):  # also after `keep`
+            self._columns = {"descriptors": self._columns["descriptors"]}
+        elif set(new_columns) != set(self._columns):
             existing, found = ", ".join(self._columns), ", ".join(new_columns)
             raise ValueError(f"expected places with {existing}, like the existing places, found {found}")
         if not n:  # a new column would require all later places to have it
             return
         for name, values in new_columns.items():
             self._columns.setdefault(name, GrowingArray(values[:0])).extend(values)
+        self._lengths.extend(_squared_lengths(new_descriptors))
         self.ids += new_ids
         self._last_query = None
 
     def keep(self, flags: Bool[np.ndarray, " n"]) -> None:
         """Keep the places whose flag is True, in order, and remove the others. Rows are renumbered."""
-        self._squared_lengths()  # so that the column of lengths has a row for each flag
         self._last_query = None
         for column in (self._lengths, *self._columns.values()):
             column.keep(flags)
@@ -280,7 +281,7 @@ class Index:
             return allowed_rows[order], np.take_along_axis(distances, order, axis=1)
         count = min(k + SPARE_ROWS, len(allowed_rows))
         if len(allowed_rows) <= GATHER_FRACTION * len(self):
-            rough = self._squared_lengths()[allowed_rows] - 2 * queries @ self.descriptors[allowed_rows].T
+            rough = self._lengths.rows[allowed_rows] - 2 * queries @ self.descriptors[allowed_rows].T
             near_rows = allowed_rows[np.argpartition(rough, count - 1, axis=1)[:, :count]]
         else:
             rough = np.where(allowed, self._relative_squared_distances(queries), np.inf)
@@ -298,16 +299,13 @@ class Index:
         last = self._last_query  # read once, because another thread may replace it
         if last is not None and last[0] == key:
             return last[1]
-        distances = self._squared_lengths() - 2 * queries @ self.descriptors.T
+        distances = self._lengths.rows - 2 * queries @ self.descriptors.T
         self._last_query = None if key is None else (key, distances)
         return distances
 
-    def _squared_lengths(self) -> Float[np.ndarray, " n"]:
-        """Return the squared lengths of all descriptors. Only those of new places are computed."""
-        new = self.descriptors[len(self._lengths) :]
-        if len(new):
-            self._lengths.extend(np.einsum("nd,nd->n", new, new))
-        return self._lengths.rows
+
+def _squared_lengths(descriptors: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+    return np.einsum("nd,nd->n", descriptors, descriptors)
 
 
 def _read_index_file(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

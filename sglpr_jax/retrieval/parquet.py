@@ -6,7 +6,7 @@ import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -127,21 +127,13 @@ def storage_errors(address: str) -> Iterator[None]:
         raise ValueError(f"{address}: expected a store that can be read and written, found: {reason}") from error
 
 
-class StoreResult(NamedTuple):
-    """Result of `embed_to_store`."""
-
-    address: str
-    """Address of the Parquet file."""
-    added: int | None
-    """Number of places that were computed, or None if the file existed."""
-
-
 def embed_to_store(
     store: str, method: Params | Method, recording: Recording, *, site: str = "", source: str = "", **options: Any
-) -> StoreResult:
+) -> tuple[str, int | None]:
     """Describe a recording and write its places to a store, unless they are there already.
 
-    Reads all files of the recording once to compute their hash.
+    Returns the address of the Parquet file, and the number of computed places, or None if the file existed. Reads all
+    files of the recording once to compute their hash.
 
     Arguments:
       store: Folder, or address in object storage.
@@ -164,7 +156,7 @@ def embed_to_store(
     with storage_errors(address):
         filesystem, path = _open(address)
         if filesystem.exists(path):
-            return StoreResult(address, None)
+            return address, None
     file = embed(method, recording, **options)
     poses = recording.world_from_lidar
     rotations = None if poses is None else poses[file.is_described][:, :3, :3]
@@ -180,7 +172,7 @@ def embed_to_store(
                 temporary.write_bytes(content.getbuffer())
         else:  # object storage shows only complete objects
             filesystem.pipe_file(path, content.getvalue())
-    return StoreResult(address, len(rows))
+    return address, len(rows)
 
 
 def stored_places(store: str) -> list[str]:

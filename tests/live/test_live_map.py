@@ -10,7 +10,7 @@ import pytest
 from sglpr_jax.data.formats.pose_files import read_tum
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.frame_log import MARK
-from sglpr_jax.live.live_map import FRAMES_LOG, LOOPS_FILE, OLD_FILES, LiveMap
+from sglpr_jax.live.live_map import FRAMES_LOG, LOOPS_FILE, LiveMap
 from sglpr_jax.live.result_files import write_results
 from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.loops.config import DetectorConfig
@@ -150,13 +150,10 @@ def test_loops_to_scans_before_a_restart_are_found_if_the_odometry_begins_again(
     live.close()
 
 
-def test_a_map_of_other_settings_or_of_an_earlier_version_is_not_continued(params, tmp_path, said):
+def test_a_map_of_other_settings_is_not_continued(params, tmp_path, said):
     opened(params, tmp_path, said).close()
     with pytest.raises(ValueError, match=r"frames.log: .*same settings, found another sensor_height; use the settings"):
         opened(params, tmp_path, said, sensor_height=2.0)
-    (tmp_path / OLD_FILES[0]).touch()
-    with pytest.raises(ValueError, match=r"expected a map of this version, found journal\.bin of an earlier one"):
-        opened(params, tmp_path, said)
 
 
 def test_scans_of_nothing_are_left_out_or_hold_no_place(drive, params, tmp_path, said):

@@ -59,22 +59,6 @@ def test_what_does_not_fit_together_is_refused(file, change, message):
         dataclasses.replace(file, **change)
 
 
-def test_a_file_of_format_1_is_compared_by_l2(tmp_path, file):
-    path = tmp_path / "08.npz"
-    file.save(path)
-    with np.load(path) as archive:
-        arrays = dict(archive)
-    about = json.loads(str(arrays["about"]))
-    del about["distance"]
-    old = {**about, "format": "sglpr-jax descriptors 1"}
-    np.savez(path, **{**arrays, "about": np.array(json.dumps(old))})
-    assert_same(DescriptorFile.load(path), dataclasses.replace(file, distance="l2"))
-    new = {**about, "format": "sglpr-jax descriptors 2"}
-    np.savez(path, **{**arrays, "about": np.array(json.dumps(new))})
-    with pytest.raises(ValueError, match=r"expected .*`distance`, found"):
-        DescriptorFile.load(path)
-
-
 @pytest.mark.parametrize(
     ("changed", "message"),
     [

@@ -181,3 +181,13 @@ def test_the_same_query_finds_places_that_were_added_or_removed_since():
     assert index.query(query).rows[0] == 20
     index.keep(np.arange(21) != 20)
     assert (index.query(query, 20).rows == before).all()
+
+
+def test_places_without_times_may_follow_removed_places_with_times(tmp_path):
+    index = Index.empty(WIDTH)
+    index.add(draw(4), times=np.arange(4.0))
+    index.keep(np.zeros(4, bool))
+    index.add(draw(2))
+    assert index.times is None and index.query(draw(2)[1]).rows[0] == 1
+    index.save(tmp_path / "places.safetensors")
+    assert len(Index.load(tmp_path / "places.safetensors")) == 2

@@ -69,11 +69,11 @@ class RosMessage:
         return self._bytes(1, length).rstrip(b"\0").decode(errors="replace")
 
     def header(self) -> Header:
-        """Read the header at the start of a sensor message."""
+        """Read the header at the start of a sensor message. The frame has no slashes at its ends (ROS 1: "/base_link")."""
         if not self._cdr:
             self.numbers("u4")  # sequence number of ROS 1
         seconds, nanoseconds = int(self.numbers("i4")[0]), int(self.numbers("u4")[0])
-        return Header(seconds + nanoseconds / 1e9, self.text())
+        return Header(seconds + nanoseconds / 1e9, self.text().strip("/"))
 
     def records(self, fields: dict[str, str]) -> np.ndarray:
         """Read the next sequence of records as a structured array. Fields of 4 bytes must precede fields of 1 byte."""
@@ -181,7 +181,7 @@ class StampedPose(NamedTuple):
 def _read_pose(message: RosMessage, *, with_child: bool = True) -> StampedPose:
     """Read header, child frame (unless the message type has none), position and quaternion."""
     header = message.header()
-    child = message.text() if with_child else ""
+    child = message.text().strip("/") if with_child else ""
     return StampedPose(header.time, child, header.frame, message.numbers("f8", 7))
 
 
@@ -303,8 +303,7 @@ def tracks_of_transforms(transforms: Iterable[tuple[int, StampedPose]]) -> list[
     """Group tf transforms, each with its recorder time (ns), into a track for each pair of child and parent frame."""
     groups: dict[tuple[str, str], list[tuple[int, StampedPose]]] = defaultdict(list)
     for recorder_ns, pose in transforms:
-        child, frame = pose.child.strip("/"), pose.frame.strip("/")  # ROS 1 may write "/base_link"
-        groups[child, frame].append((recorder_ns, pose._replace(child=child, frame=frame)))
+        groups[pose.child, pose.frame].append((recorder_ns, pose))
     return [Track.of(poses) for _, poses in sorted(groups.items())]
 
 

@@ -71,7 +71,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         containers=bag.files,
         found=(f"format: {topic} of {bag.name}, {bag.describe_fields(topic, first_ns)}",),
     )
-    lidar_frame = bag.message(topic, first_ns).header().frame.strip("/")
+    lidar_frame = bag.message(topic, first_ns).header().frame
     recording = _with_poses(recording, bag, stamps, options.pose_topic, lidar_frame)
     imu_topic = _imu_topic(bag, topic, options.imu_topic)
     if imu_topic is None:
@@ -194,10 +194,9 @@ def _child_from_lidar(track: Track, transforms: list[Track], lidar_frame: str) -
     """Return the transform child_from_lidar by tf, or else the identity, and how the LiDAR's poses are computed."""
     if not track.rotates:
         return np.eye(4), "interpolated; its rotations are constant or missing"
-    child = track.child.strip("/")
-    if not child or child == lidar_frame:
+    if track.child in ("", lidar_frame):
         return np.eye(4), "interpolated"
-    child_from_lidar = static_transform(transforms, child, lidar_frame)
+    child_from_lidar = static_transform(transforms, track.child, lidar_frame)
     if child_from_lidar is None:
         used = f"used as poses of {lidar_frame or 'the LiDAR'}, since tf does not connect the two frames"
         return np.eye(4), f"interpolated; {used}"
@@ -223,7 +222,6 @@ def _read_ups(
     Without gravity, raises ValueError if the IMU is `required`, or else warns and returns None.
     """
     stamps, imu_frame, imu = bag.read(topic, read_imu)
-    imu_frame = imu_frame.strip("/")
     source = f"{bag.paths[0]}, {topic}"
     imu_times, scan_times, problem = times_on_one_clock(stamps, scans)
     if problem:
