@@ -69,7 +69,7 @@ class RosMessage:
         return self._bytes(1, length).rstrip(b"\0").decode(errors="replace")
 
     def header(self) -> Header:
-        """Read the header at the start of a sensor message. The frame has no slashes at its ends (ROS 1: "/base_link")."""
+        """Read the header at the start of a sensor message, without slashes at the ends of the frame (ROS 1)."""
         if not self._cdr:
             self.numbers("u4")  # sequence number of ROS 1
         seconds, nanoseconds = int(self.numbers("i4")[0]), int(self.numbers("u4")[0])
