@@ -313,7 +313,7 @@ def open_with_odometry(
     Returns:
       The command with the values that replace `auto`, the recordings, and a list of their odometry or an empty list.
     """
-    from sglpr_jax.data.deskew import has_point_times  # slow imports, not needed for --help
+    from sglpr_jax.data.deskew import point_times_problem  # slow imports, not needed for --help
     from sglpr_jax.odometry.kiss_icp import check_installed
 
     poses, submaps = [], [command.submap] * len(paths)
@@ -322,7 +322,7 @@ def open_with_odometry(
         recordings = [command.source.open(path) for path in paths]
         command = dataclasses.replace(command, scale=resolved_scale(command.scale, *recordings))
         poses = [_odometry_of(recording, command, checkpoint(number)) for number, recording in enumerate(recordings)]
-        has_times = list(map(has_point_times, recordings))
+        has_times = [not point_times_problem(recording) for recording in recordings]
         submaps = [dataclasses.replace(command.submap, deskew=command.submap.deskew or has) for has in has_times]
         submap = dataclasses.replace(command.submap, deskew=all(each.deskew for each in submaps))
         settings = dataclasses.replace(command.scan_odometry, voxel_m=command.scan_odometry.used_voxel_m)

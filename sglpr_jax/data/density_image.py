@@ -41,13 +41,6 @@ def as_counts(grey: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
     return np.ascontiguousarray(grey) * np.float32(DENSITY_MAX_COUNT / 255)
 
 
-def density_label_bev(
-    points: Float32[np.ndarray, "n 3"], classes: Int[np.ndarray, " n"]
-) -> Int32[np.ndarray, "151 151"]:
-    """Compute the map of classes aligned with `density_bev`: `density_label_image` in the orientation of equation 1."""
-    return np.ascontiguousarray(np.rot90(density_label_image(points, classes), -1))
-
-
 def density_image(points: Float32[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "151 151"]:
     """Compute the density image of a scan: voxel centroids per cell, capped at 10 and scaled to a maximum of 255.
 

@@ -132,11 +132,6 @@ def _rows_near(times: Float[np.ndarray, " n"], row: int) -> list[int]:
     return [near for near in rows if abs(times[near] - times[row]) <= WIDEST_S]
 
 
-def has_point_times(recording: Recording) -> bool:
-    """Whether the motion within the scans can be removed (`point_times_problem`)."""
-    return not point_times_problem(recording)
-
-
 def point_times_problem(recording: Recording) -> str:
     """Describe why the motion within the scans cannot be removed: "no valid times of points". Empty if it can be.
 

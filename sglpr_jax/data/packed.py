@@ -16,7 +16,7 @@ import numpy as np
 from sglpr_jax.data.formats.png import image_scan
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
-from sglpr_jax.files import file_name, in_short, raising_write_error, read_json, replacing
+from sglpr_jax.files import file_name, in_short, read_json, replacing
 
 FORMAT = "sglpr-jax packed recording 1"
 ABOUT_FILE = "pack.json"
@@ -123,7 +123,7 @@ def _write_arrays(folder: Path, recording: Recording, on_progress: Callable[[int
     with contextlib.ExitStack() as opened:
         for i in range(len(recording)):
             for name, array in _arrays(recording, i).items():
-                path, row_shape = folder / f"{name}.bin", array.shape[1:]
+                row_shape = array.shape[1:]
                 layout = {"dtype": array.dtype.str, "row": row_shape, "offsets": [0], "checksums": []}
                 layout = layouts.setdefault(name, layout)
                 if (layout["dtype"], layout["row"]) != (array.dtype.str, row_shape):
@@ -132,24 +132,15 @@ def _write_arrays(folder: Path, recording: Recording, on_progress: Callable[[int
                         f"of shape {layout['row']}, like the first array of the pack, found {array.dtype} {row_shape}"
                     )
                 array = np.ascontiguousarray(array)
-                with raising_write_error(path):
-                    if name not in streams:
-                        streams[name] = path.open("xb")
-                        opened.callback(_close, streams[name])
-                    streams[name].write(array.data)
+                if name not in streams:
+                    streams[name] = opened.enter_context((folder / f"{name}.bin").open("xb"))
+                streams[name].write(array.data)
                 layout["checksums"].append(_checksum(array))
                 layout["offsets"].append(layout["offsets"][-1] + len(array))
             on_progress(i + 1)
-        for name, stream in streams.items():
-            with raising_write_error(folder / f"{name}.bin"):
-                _sync(stream)
+        for stream in streams.values():
+            _sync(stream)
     return layouts
-
-
-def _close(stream: IO) -> None:
-    """Close a file. An error is ignored, because an earlier error of the same file is already raised."""
-    with contextlib.suppress(OSError):
-        stream.close()
 
 
 def _sync(stream: IO) -> None:

@@ -62,7 +62,7 @@ def widest_gap_s(stamps: Float[np.ndarray, " n"]) -> float:
 
 
 def have_poses(stamps: Float[np.ndarray, " n"], times: Float[np.ndarray, " q"]) -> Bool[np.ndarray, " q"]:
-    """Whether a pose can be interpolated at each of `times`: the poses around it are at most `widest_gap_s` apart.
+    """Whether a pose is known at each of `times`: one has this time, or those around it are at most `widest_gap_s` apart.
 
     `stamps` are the times of the poses in seconds, in any order. A time may be up to `BEYOND_S` before or after them.
     """
@@ -71,7 +71,7 @@ def have_poses(stamps: Float[np.ndarray, " n"], times: Float[np.ndarray, " q"]) 
         return np.zeros(len(times), bool)
     next_pose = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)
     has_small_gap = stamps[next_pose] - stamps[next_pose - 1] <= widest_gap_s(stamps)
-    return has_small_gap & (times >= stamps[0] - BEYOND_S) & (times <= stamps[-1] + BEYOND_S)
+    return (has_small_gap | np.isin(times, stamps)) & (times >= stamps[0] - BEYOND_S) & (times <= stamps[-1] + BEYOND_S)
 
 
 def interpolate_poses(

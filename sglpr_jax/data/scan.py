@@ -5,7 +5,6 @@ takes 2 ms to 1 s, so only one unit fits the span of its times.
 """
 
 import os
-from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -60,16 +59,6 @@ def check_cloud(points: Float32[np.ndarray, "n _"], *, name: str = "") -> None:
             f" {np.median(largest):.4g} and the farthest at {largest.max():.4g}; are the coordinates in millimetres,"
             " or is the format of the scan wrong (--format, for .bin files)?"
         )
-
-
-def time_field_of(names: Collection[str]) -> str | None:
-    """Return the first of `TIME_FIELDS` among the names of the fields of a point, or None."""
-    return next((name for name in TIME_FIELDS if name in names), None)
-
-
-def laser_field_of(names: Collection[str]) -> str | None:
-    """Return the first of `LASER_FIELDS` among the names of the fields of a point, or None."""
-    return next((name for name in LASER_FIELDS if name in names), None)
 
 
 class TimeField(NamedTuple):

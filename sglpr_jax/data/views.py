@@ -19,7 +19,7 @@ from sglpr_jax.bev import (
     rotate_labels,
     rotate_points,
 )
-from sglpr_jax.data.density_image import density_bev, density_label_bev
+from sglpr_jax.data.density_image import density_bev, density_label_image
 from sglpr_jax.data.scan import Scan, check_cloud
 from sglpr_jax.grid import DENSITY_MAX_COUNT, Grid, ImageKind, check_density_grid
 
@@ -102,7 +102,9 @@ def picture(
         assert scan.image is not None
         return scan.image, classes
     points = scan.upright_points
-    return density_bev(points), None if classes is None else density_label_bev(points, classes)
+    if classes is not None:
+        classes = np.ascontiguousarray(np.rot90(density_label_image(points, classes), -1))
+    return density_bev(points), classes
 
 
 def image_view(

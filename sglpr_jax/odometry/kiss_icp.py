@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import Scale
-from sglpr_jax.data.deskew import has_point_times, point_times_problem, poses_at, valid_point_times
+from sglpr_jax.data.deskew import point_times_problem, poses_at, valid_point_times
 from sglpr_jax.data.fingerprint import fingerprint
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled, scaled_poses
@@ -111,7 +111,7 @@ def _register_scans(
 
     New results are appended to the log. The options are those of `scan_stream`.
     """
-    is_timed = has_point_times(recording)
+    is_timed = not point_times_problem(recording)
     results = list[np.ndarray]()
     for row, cloud in scan_stream(scaled(recording, scale), lambda _, scan: _cloud(scan, is_timed), **options):
         known = logged.get(row)

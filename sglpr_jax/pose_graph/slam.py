@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import Scale
-from sglpr_jax.data.deskew import deskewed, has_point_times
+from sglpr_jax.data.deskew import deskewed, point_times_problem
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import OnBadScan
@@ -88,7 +88,7 @@ def slam(
         )
     with progress(f"loops {scans.name}", len(scans)) as show:
         loops = find_loops(
-            deskewed(scans, poses) if has_point_times(scans) else scans,
+            scans if point_times_problem(scans) else deskewed(scans, poses),
             load(params) if isinstance(params, str) else params,
             odometry=poses,
             config=config,

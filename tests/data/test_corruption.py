@@ -19,7 +19,7 @@ from sglpr_jax.data.corruption import (
     ring_numbers,
 )
 from sglpr_jax.data.corruption import corrupted as corrupted_recording
-from sglpr_jax.data.formats.scan_files import read_scan_file
+from sglpr_jax.data.formats.scan_files import scan_of_file
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.sim.sensor import HDL64E_DEG
 
@@ -123,7 +123,7 @@ def test_real_scans(shared):
     kitti = next((shared / "data/kitti_odometry/sequences/00/velodyne").glob("*.bin"))
     nuscenes = samples / "nuscenes_32_beams.pcd.bin"
     for path, expected in ((nclt, 32), (nuscenes, 32), (samples / "16_beams.pcd", 16), (kitti, 64)):
-        found = read_scan_file(path)
+        found = scan_of_file(path)
         points, lasers = found.points, found.lasers
         finite = np.isfinite(points).all(axis=1)
         rings = ring_numbers(points[finite], lasers=None if lasers is None else lasers[finite])

@@ -11,7 +11,7 @@ from recordings import of_scans
 from scipy.linalg import expm, logm
 
 import sglpr_jax
-from sglpr_jax.data.deskew import deskew, deskewed, has_point_times, point_times_problem, poses_at
+from sglpr_jax.data.deskew import deskew, deskewed, point_times_problem, poses_at
 from sglpr_jax.data.scan import Scan, TimeField
 from sglpr_jax.files import DataWarning
 
@@ -105,7 +105,7 @@ def test_only_scans_without_valid_times_of_points_are_not_deskewed():
         return dataclasses.replace(scan, time_field=others.get(path.stem, scan.time_field))
 
     odd = dataclasses.replace(recording, read=read)
-    assert has_point_times(odd)
+    assert not point_times_problem(odd)
     found = deskewed(odd, poses)
     with pytest.warns(DataWarning, match="scan 000 of sequence 08: expected times .* motion within this scan is not"):
         np.testing.assert_array_equal(found.points(0), clouds[0])
@@ -123,7 +123,7 @@ def test_why_scans_cannot_be_deskewed_is_said():
         ("no times of scans", dataclasses.replace(recording, times=None)),
         ("no valid times of points", recording_of(times, clouds, within=0 * WITHIN)),
     ):
-        assert point_times_problem(other) == problem and not has_point_times(other)
+        assert point_times_problem(other) == problem
 
 
 def test_invalid_arguments_are_one_clear_error():

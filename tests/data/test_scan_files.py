@@ -17,8 +17,8 @@ from sglpr_jax.data.formats.scan_files import (
     format_by_name,
     read_labels,
     read_scan,
-    read_scan_file,
     scan_id,
+    scan_of_file,
 )
 from sglpr_jax.files import DataWarning
 
@@ -52,7 +52,7 @@ def write(folder: Path, name: str, content: bytes) -> Path:
 @pytest.mark.parametrize("name", FILES)
 def test_every_format(tmp_path, name):
     content, timed = FILES[name]
-    found = read_scan_file(write(tmp_path, name, content))
+    found = scan_of_file(write(tmp_path, name, content))
     np.testing.assert_array_equal(found.points, CLOUD)
     assert found.points.dtype == np.float32 and (found.lasers is None) == (not timed)
     assert (found.time_field is not None) == timed
@@ -72,12 +72,12 @@ def test_records_without_a_header(tmp_path):
     kitti = write(tmp_path, "0.bin", np.array([[1, 2, 3, 0.5], [4, 5, np.nan, 0.5]], "<f4").tobytes())
     np.testing.assert_array_equal(read_scan(kitti), np.float32([[1, 2, 3], [4, 5, np.nan]]))
     assert read_scan(kitti).flags.f_contiguous
-    nuscenes = read_scan_file(write(tmp_path, "a.pcd.bin", np.array([[1, 2, 3, 0.5, 31]], "<f4").tobytes()))
+    nuscenes = scan_of_file(write(tmp_path, "a.pcd.bin", np.array([[1, 2, 3, 0.5, 31]], "<f4").tobytes()))
     assert nuscenes.points.tolist() == [[2, -1, 3]] and nuscenes.lasers.tolist() == [31]
     raw = np.array([[20001, 20002, 20003], [0, 65535, 7]], "<u2")
     records = np.zeros(2, [("xyz", "<u2", 3), ("rest", "u1", 2)])
     records["xyz"], records["rest"] = raw, [[200, 5], [100, 31]]
-    nclt = read_scan_file(write(tmp_path, "velodyne_sync/1.bin", records.tobytes()))
+    nclt = scan_of_file(write(tmp_path, "velodyne_sync/1.bin", records.tobytes()))
     expected = (raw.astype(np.float64) * 0.005 - 100) * [1, -1, -1]  # turned, not mirrored
     np.testing.assert_array_equal(nclt.points, expected.astype(np.float32))
     assert nclt.lasers.tolist() == [5, 31]
@@ -163,7 +163,7 @@ BROKEN = [
 @pytest.mark.parametrize(("name", "content", "message"), BROKEN, ids=range(len(BROKEN)))
 def test_a_broken_file_is_named(tmp_path, name, content, message):
     with pytest.raises(ValueError, match=rf"^{tmp_path}/{name}: .*{message}"):
-        read_scan_file(write(tmp_path, name, content))
+        scan_of_file(write(tmp_path, name, content))
     with pytest.raises(FileNotFoundError, match=r"none\.pcd: expected a scan, found none"):
         read_scan(tmp_path / "none.pcd")
 

@@ -11,7 +11,7 @@ from PIL import Image
 from recordings import of_images, of_scans
 
 from sglpr_jax.bev import even_cells, rasterize, rasterize_labels, rotate_image, rotate_labels
-from sglpr_jax.data.density_image import density_bev, density_label_bev
+from sglpr_jax.data.density_image import density_bev, density_label_image
 from sglpr_jax.data.formats.png import label_image_pixels
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.grid import Grid
@@ -200,7 +200,8 @@ def test_scans_become_density_images_of_all_their_points(recordings, pool):
         assert labelled.labelled[row] == (recording.labels(number) is not None)
         if labelled.labelled[row]:
             classes = to_classes(recording.labels(number))
-            np.testing.assert_array_equal(labelled.maps[row], density_label_bev(recording.points(number), classes))
+            found = density_label_image(recording.points(number), classes)
+            np.testing.assert_array_equal(labelled.maps[row], np.rot90(found, -1))
 
 
 def test_images_of_two_sizes_are_refused(pool):

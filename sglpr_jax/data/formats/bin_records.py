@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float, Num
 
 from sglpr_jax.data.choices import RecordFormat
-from sglpr_jax.data.formats.clouds import check_points
-from sglpr_jax.data.scan import Scan, TimeField, laser_field_of, time_field_of
+from sglpr_jax.data.formats.clouds import check_points, cloud_scan
+from sglpr_jax.data.scan import Scan
 from sglpr_jax.files import naming, warn
 
 NCLT_RECORD = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
@@ -75,17 +75,10 @@ def read_record_file(path: Path, record: np.dtype, *, format: str) -> Scan:
     with naming(path):  # errors begin with the path
         check_points(size // record.itemsize, bytes_each=record.itemsize)
     points = np.fromfile(path, dtype=record)
-    names = record.names or ()
-    laser_field = laser_field_of(names)
-    time_field = time_field_of(names)
     with np.errstate(over="ignore", invalid="ignore"):  # callers drop invalid coordinates
         xyz = AXES[format](points["xyz"]) if format in AXES else points["xyz"]
-        return Scan(
-            # Column-major order: the copy takes half the time, and later steps work along the axes.
-            points=np.asfortranarray(xyz, dtype=np.float32),
-            lasers=None if laser_field is None else points[laser_field].astype(np.int32),
-            time_field=None if time_field is None else TimeField(time_field, points[time_field].copy()),
-        )
+        # Column-major order: the copy takes half the time, and later steps work along the axes.
+        return cloud_scan(points, points=np.asfortranarray(xyz, dtype=np.float32))
 
 
 MAX_COORDINATE_M = 300.0

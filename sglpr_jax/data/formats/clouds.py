@@ -3,8 +3,9 @@
 from collections.abc import Mapping
 
 import numpy as np
+from jaxtyping import Float32
 
-from sglpr_jax.data.scan import Scan, TimeField
+from sglpr_jax.data.scan import LASER_FIELDS, TIME_FIELDS, Scan, TimeField
 
 MOST_POINTS = 1 << 24
 """Maximum number of points of a scan. A LiDAR of 128 beams returns about 2**18 points a turn."""
@@ -15,12 +16,17 @@ BLOCK_POINTS = 1 << 21
 
 
 def cloud_scan(
-    columns: Mapping[str, np.ndarray] | np.ndarray, *, time: str | None = None, laser: str | None = None
+    columns: Mapping[str, np.ndarray] | np.ndarray, *, points: Float32[np.ndarray, "n 3"] | None = None
 ) -> Scan:
-    """Create a scan from the columns x, y and z in metres, and those named `time` and `laser` if they are given."""
+    """Create a scan from `points`, or the columns x, y and z, in metres, and from the columns of times and lasers, if
+    any: the first of `TIME_FIELDS` and of `LASER_FIELDS`."""
+    names = columns.dtype.names or () if isinstance(columns, np.ndarray) else columns
+    time, laser = (next((name for name in known if name in names), None) for known in (TIME_FIELDS, LASER_FIELDS))
     with np.errstate(over="ignore", invalid="ignore"):  # callers drop invalid points
+        if points is None:
+            points = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float32)
         return Scan(
-            points=np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float32),
+            points=points,
             lasers=None if laser is None else columns[laser].astype(np.int32),
             time_field=None if time is None else TimeField(time, np.array(columns[time])),  # copy: frees other columns
         )

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from sglpr_jax.data.formats.clouds import BLOCK_POINTS, check_points, cloud_scan
-from sglpr_jax.data.scan import Scan, time_field_of
+from sglpr_jax.data.scan import TIME_FIELDS, Scan
 from sglpr_jax.extras import install_command, optional_module
 from sglpr_jax.files import warn
 
@@ -27,11 +27,9 @@ def las_scan(path: Path) -> Scan:
     """Read the points of a .las file in metres, and their times if it has any. The axes are not changed."""
     with _checked_laspy(path, one_scan=True).open(path) as stream:
         points = stream.read()  # laspy applies the scale and offset of the header to x, y and z
-    time = time_field_of(list(points.point_format.dimension_names))
+    names = set(points.point_format.dimension_names)
     columns = dict(zip("xyz", _coordinates(points, path), strict=True))
-    if time is not None:
-        columns[time] = np.asarray(points[time])
-    return cloud_scan(columns, time=time)
+    return cloud_scan(columns | {name: np.asarray(points[name]) for name in TIME_FIELDS if name in names})
 
 
 def las_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:

@@ -18,7 +18,7 @@ from jaxtyping import Float64
 from sglpr_jax.data.formats import clouds
 from sglpr_jax.data.formats.clouds import check_points, cloud_scan
 from sglpr_jax.data.formats.pose_files import parse_numbers, quaternion_poses
-from sglpr_jax.data.scan import Scan, laser_field_of, time_field_of
+from sglpr_jax.data.scan import LASER_FIELDS, TIME_FIELDS, Scan
 from sglpr_jax.files import in_short, warn
 from sglpr_jax.se3 import transformed
 
@@ -72,11 +72,9 @@ def table_scan(path: Path, *, parse: Parser) -> Scan:
     table = parse(path.read_bytes())
     check_points(table.points, bytes_each=table.row_bytes)
     names = [field.name for field in table.fields if field.count == 1]
-    names = [name for name in names if names.count(name) == 1]
-    time, laser = time_field_of(names), laser_field_of(names)
+    wanted = [*AXES, *(name for name in (*TIME_FIELDS, *LASER_FIELDS) if names.count(name) == 1)]
     decoders = {"binary": _binary_records, "binary_compressed": _compressed_columns, "ascii": _text_columns}
-    columns = decoders[table.encoding](table, [*AXES, *filter(None, (time, laser))])
-    return cloud_scan(columns, time=time, laser=laser)
+    return cloud_scan(decoders[table.encoding](table, wanted))
 
 
 def table_blocks(path: Path, *, parse: Parser) -> Iterator[Float64[np.ndarray, "_ 3"]]:

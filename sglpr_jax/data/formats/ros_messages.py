@@ -17,7 +17,7 @@ from sglpr_jax.data.formats.clouds import check_points, cloud_scan
 from sglpr_jax.data.formats.pose_files import FARTHEST_POSITION_M
 from sglpr_jax.data.imu import Imu
 from sglpr_jax.data.poses import LEAST_SHARE, have_poses
-from sglpr_jax.data.scan import LASER_FIELDS, TIME_FIELDS, Scan, laser_field_of, time_field_of
+from sglpr_jax.data.scan import LASER_FIELDS, TIME_FIELDS, Scan
 from sglpr_jax.data.times import time_unit_problem
 from sglpr_jax.files import warn
 from sglpr_jax.se3 import from_quaternions, have_unit_length, poses_of
@@ -107,8 +107,7 @@ def read_point_cloud2(message: Any, *, name: str = "cloud") -> Scan:
         if _in_metres(swapped):
             warn(f"{name}: expected big-endian points, as is_bigendian states, found little-endian points")
             points = swapped
-    names = points.dtype.names or ()
-    return cloud_scan(points, time=time_field_of(names), laser=laser_field_of(names))
+    return cloud_scan(points)
 
 
 def _point_bytes(message: Any) -> UInt8[np.ndarray, " n"]:
@@ -156,7 +155,7 @@ def read_custom_msg(message: RosMessage) -> Scan:
     points = message.records(LIVOX_FIELDS)
     if not len(points):
         raise ValueError("expected at least one point, found none")
-    return cloud_scan(points, time="offset_time", laser="line")
+    return cloud_scan(points)
 
 
 class StampedPose(NamedTuple):

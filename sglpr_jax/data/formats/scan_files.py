@@ -159,23 +159,7 @@ def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.nd
       ImportError: If the file is a .las file and the extra `las` is not installed.
     """
     path = Path(path)
-    return read_scan_file(path, format=detect_format(path) if format == "auto" else format).cloud
-
-
-def read_scan_file(path: Path, *, format: ScanFormat = "auto", records: RecordFormat = "kitti") -> Scan:
-    """Read the points of a scan, with the laser numbers and times that the file contains.
-
-    The format "auto" does not use the content: `records` is the format of .bin files whose name does not define it.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a scan, found none")
-    check_value(format, ScanFormat, f"{path}, format")
-    file_format = (format_by_name(path) or records) if format == "auto" else format
-    if is_headerless(file_format):
-        return read_records(path, file_format)
-    with _format_errors(path, file_format.partition("-")[0]):
-        check_bytes(path.stat().st_size)
-        return READERS[file_format](path)
+    return scan_of_file(path, format=detect_format(path) if format == "auto" else format).cloud
 
 
 def scan_of_file(
@@ -185,11 +169,21 @@ def scan_of_file(
     format: ScanFormat = "auto",
     records: RecordFormat = "kitti",
 ) -> Scan:
-    """Read a scan, and the labels of its points if `labels` is given. This is the `Recording.read` of scan files.
+    """Read a scan with the laser numbers and times that its file contains, and its labels if `labels` is given.
 
-    `format` and `records` are those of `read_scan_file`.
+    This is the `Recording.read` of scan files. The format "auto" does not use the content: `records` is the format of
+    .bin files whose name does not define it.
     """
-    scan = read_scan_file(path, format=format, records=records)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a scan, found none")
+    check_value(format, ScanFormat, f"{path}, format")
+    file_format = (format_by_name(path) or records) if format == "auto" else format
+    if is_headerless(file_format):
+        scan = read_records(path, file_format)
+    else:
+        with _format_errors(path, file_format.partition("-")[0]):
+            check_bytes(path.stat().st_size)
+            scan = READERS[file_format](path)
     if labels is None:
         return scan
     return dataclasses.replace(scan, labels=read_labels(labels, points=len(scan.cloud)), labels_file=labels)

@@ -187,11 +187,6 @@ def _recordings(root: Path, layouts: tuple[Layout, ...]) -> dict[str, tuple[Path
     return {f"{folder.resolve().name}{layout.suffix}": (folder, layout) for folder, layout in recordings}
 
 
-def recording_names(root: Path, *, layouts: tuple[Layout, ...]) -> tuple[str, ...]:
-    """Return the names of the recordings in `root`. `root` may be a sequence itself."""
-    return tuple(_recordings(root, layouts))
-
-
 def open_recording(root: Path, name: str, options: ReadOptions, *, layouts: tuple[Layout, ...]) -> Recording:
     """Open the scans with a pose within `Layout.max_gap_s`, each with the position of the nearest pose in time."""
     folder, layout = _recordings(root, layouts)[name]
@@ -236,7 +231,7 @@ def open_recording(root: Path, name: str, options: ReadOptions, *, layouts: tupl
 READERS = tuple(
     Reader(
         pattern,
-        partial(recording_names, layouts=layouts),
+        lambda root, layouts=layouts: tuple(_recordings(root, layouts)),
         partial(open_recording, layouts=layouts),
         knows_mounting=layouts[0].mounting is not None,
         rank=rank,

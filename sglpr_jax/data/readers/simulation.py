@@ -29,7 +29,7 @@ def simulated_mounting(root: Path) -> Mounting | None:
     """Return the mounting of the sensor of a simulated dataset, or None for a height of 1.73 m (KITTI), and for a
     sensor in a hand, whose scans show it."""
     path, settings = root / SIMULATION, _settings(root)
-    if settings is None or _is_walked(settings):
+    if settings is None or is_in_a_hand(root):
         return None
     try:
         height_m = float(settings.get("height_m", settings["sensor"]["height_m"]))
@@ -42,13 +42,7 @@ def simulated_mounting(root: Path) -> Mounting | None:
 
 def is_in_a_hand(root: Path) -> bool:
     """Return whether a simulated sensor tilts with the steps of a person, so that no mounting fits all scans."""
-    settings = _settings(root)
-    return settings is not None and _is_walked(settings)
-
-
-def _is_walked(settings: dict[str, Any]) -> bool:
-    """Return whether the carrier of the settings is a person."""
-    carrier = settings.get("carrier")
+    carrier = (_settings(root) or {}).get("carrier")
     return isinstance(carrier, dict) and bool(carrier.get("walks"))
 
 
