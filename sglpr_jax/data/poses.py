@@ -64,7 +64,8 @@ def widest_gap_s(stamps: Float[np.ndarray, " n"]) -> float:
 def have_poses(stamps: Float[np.ndarray, " n"], times: Float[np.ndarray, " q"]) -> Bool[np.ndarray, " q"]:
     """Whether a pose is known at each of `times`: one has this time, or those around it are near (`widest_gap_s`).
 
-    `stamps` are the times of the poses in seconds, in any order. A time may be up to `BEYOND_S` before or after them.
+    `stamps` are the times of two or more poses in seconds, in any order. A time may be up to `BEYOND_S` before or after
+    them.
     """
     stamps = np.unique(stamps)
     if len(stamps) < 2:

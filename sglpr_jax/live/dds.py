@@ -81,7 +81,7 @@ class DdsTransport:
             condition = ReadCondition(reader, ViewState.Any | InstanceState.Any | SampleState.NotRead)
             self._deliveries.append(functools.partial(self._deliver, kind, reader, condition, receive, depth))
             self._waiting.attach(condition)
-            self._qos_statuses[mismatch] = reader.get_requested_incompatible_qos_status
+        self._qos_statuses[mismatch] = reader.get_requested_incompatible_qos_status  # one for all types
 
     def advertise(self, topic: str, kind: str, *, depth: int, latched: bool) -> Callable[[bytes], None]:
         qos = _qos(depth, reliable=True, latched=latched)

@@ -25,9 +25,10 @@ from sglpr_jax.loops.comparison import NO_FITS, Fits
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.pose_graph.files import loop_lines, read_loops_jsonl
+from sglpr_jax.pose_graph.folder import LOOPS_JSONL
 from sglpr_jax.pose_graph.incremental import IncrementalTrajectory
 
-FRAMES_LOG, LOOPS_FILE = "frames.log", "loops.jsonl"
+FRAMES_LOG = "frames.log"
 SYNC_S = 5.0
 """Time after which new scans are forced to the disk, in seconds. A loss of power costs at most these scans."""
 MAX_PAUSE_S = 1e8
@@ -112,7 +113,7 @@ class LiveMap:
         about = {"format": FRAME_FORMAT, "weights": detector.finder.index.weights_hash, "sensor_height": sensor_height}
         settings = {**about, **dataclasses.asdict(detector.config)}
         self._log: FrameLog | None = FrameLog(folder / FRAMES_LOG, settings)
-        self._loops_path, self._loops_file = folder / LOOPS_FILE, -1
+        self._loops_path, self._loops_file = folder / LOOPS_JSONL, -1
         self._synced_at = time.monotonic()
 
     def __len__(self) -> int:

@@ -184,7 +184,7 @@ def add_scans(
                     is_other = about["missing"] != len(finder.missing)  # other scans before it could be read
                     if is_other or (keyframe is None and on_bad_scan is None):
                         break
-                    next_row()  # the checkpoint has only frames
+                    next_row()  # skips the scans before the frame, which the checkpoint does not have
                     add(keyframe, fits)
                 if len(finder) > before:
                     on_progress(finder.scans)

@@ -22,7 +22,7 @@ class TupleConfig:
     revisit_fraction: Share = 0.5
     """Fraction of tuples with positives from another visit. In the other tuples, positives are neighbouring frames."""
     revisit_gap: CountOrZero = SAME_PASS_FRAMES
-    """Minimum length of a visit, in frames. It lasts until the sensor is away for more frames than this."""
+    """Minimum length of a visit, in frames. It lasts until the sensor is away for as many frames."""
     cluster: Count = 1
     """Number of consecutive tuples with anchors near each other, so that shared negatives are from the same street."""
     cluster_m: NotNegative = 100.0

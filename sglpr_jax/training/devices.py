@@ -39,7 +39,7 @@ def data_mesh(config: TrainConfig, devices: Sequence[Any] | None = None) -> Mesh
     work = f"the {config.tuples} tuples of a step and the {config.images_at_once} images of a chunk"
     divisible = math.gcd(config.tuples, config.images_at_once)
     if config.also_tuples:
-        divisible, work = 1, "1, because a batch of two datasets stays on one device"
+        divisible, work = 1, "1 (a batch of two datasets stays on one device)"
     used = max((n for n in range(1, available + 1) if divisible % (n * hosts) == 0), default=0)
     if not used:
         raise ValueError(f"expected {work} to be divisible by the number of hosts, found {hosts} hosts")

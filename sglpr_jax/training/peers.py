@@ -207,7 +207,8 @@ def train_learned(
 
 
 class _ReportLines(Callback):
-    """Reports the loss every 30 s of training and with each score, and the scores. Shows the training time."""
+    """Reports the loss every 30 s of training and, with held-out recordings, the loss and the scores at each snapshot.
+    Shows the training time."""
 
     def __init__(self, report: Callable[[str], None], show: Callable[[int], None]):
         self._report, self._show, self._last_report_s, self._line = report, show, 0.0, ""

@@ -185,13 +185,13 @@ def visit_ends(
     gap: int,
 ) -> Int[np.ndarray, "n"]:
     """Return the last place of the visit at each place: `gap` frames later, or the last place before the sensor is away
-    for more than `gap` frames. A vehicle at a traffic light does not visit the place again and again.
+    for `gap` frames. A vehicle at a traffic light does not visit the place again and again.
 
     Arguments:
       pairs: All pairs of places within the positive distance, the earlier place first.
       recording_of: Recording of each place, in order.
       frame_of: Frame of each place, in order within its recording.
-      gap: Minimum length of a visit, and maximum absence during it, in frames.
+      gap: Minimum length of a visit, and of the absence that ends it, in frames.
     """
     pairs = pairs[np.lexsort(pairs.T[::-1])]
     first, later = pairs.T

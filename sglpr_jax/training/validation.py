@@ -72,13 +72,13 @@ def validation_score(
         raise ValueError(f"the part held out by validation.share is too small: {error}") from error
     angles = np.random.default_rng(_SEED).uniform(0, 2 * np.pi, len(pool)) * config.rotate
     places = np.arange(len(pool))
-    itself, same_visit = np.eye(len(pool), dtype=bool), pool.are_of_one_visit(places[:, None], places[None])
 
     def score(params: Params) -> dict[str, float]:
         descriptors = describe_places(params, recordings, pool, places, angles, config)
-        neighbours, _ = recall_and_f1_max(descriptors, pool, itself)
+        neighbours, _ = recall_and_f1_max(descriptors, pool, np.eye(len(pool), dtype=bool))
         if not len(pool.revisits.anchors):
             return {"score": neighbours, "recall_neighbours": neighbours}
+        same_visit = pool.are_of_one_visit(places[:, None], places[None])
         revisits, f1_max = recall_and_f1_max(descriptors, pool, same_visit)
         score = (revisits + f1_max) / 2
         return {"score": score, "recall_neighbours": neighbours, "recall_revisits": revisits, "f1max": f1_max}

@@ -27,7 +27,7 @@ def test_a_missing_package_is_reported_before_the_simulation(command, tmp_path, 
     def missing():
         raise ImportError("odometry from scans needs kiss-icp")
 
-    monkeypatch.setattr(kiss_icp, "_library", missing)
+    monkeypatch.setattr(kiss_icp, "check_installed", missing)
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert_one_line_error(command("demo", "--out", tmp_path / "demo"), "needs kiss-icp")
     assert not (tmp_path / "demo").exists()

@@ -10,13 +10,14 @@ import pytest
 from sglpr_jax.data.formats.pose_files import read_tum
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.frame_log import MARK
-from sglpr_jax.live.live_map import FRAMES_LOG, LOOPS_FILE, LiveMap
+from sglpr_jax.live.live_map import FRAMES_LOG, LiveMap
 from sglpr_jax.live.result_files import write_results
 from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Keyframe
 from sglpr_jax.pose_graph.files import read_loops_jsonl
+from sglpr_jax.pose_graph.folder import LOOPS_JSONL
 from sglpr_jax.registration.bev_search import CorrelationPeak
 from sglpr_jax.se3 import inverse, transform
 from tests.live.conftest import BEGIN, SCANS, live_frame
@@ -56,22 +57,22 @@ def test_edges_of_a_drive_are_true_and_on_disk(drive, whole):
         assert np.linalg.norm(drive.positions[edge.query] - drive.positions[edge.match]) < 12
         assert edge.query_time - edge.match_time == pytest.approx(drive.times[edge.query] - drive.times[edge.match])
         assert np.array_equal(edge.world_from_match, drive.poses.world_from_lidar[edge.match])
-    assert pairs(read_loops_jsonl(folder / LOOPS_FILE)) == pairs(edges)
+    assert pairs(read_loops_jsonl(folder / LOOPS_JSONL)) == pairs(edges)
 
 
 @pytest.mark.slow
 def test_a_map_is_recalled_without_its_unfinished_end(params, whole, tmp_path, said):
     folder, edges = whole
-    content, lines = (folder / FRAMES_LOG).read_bytes(), (folder / LOOPS_FILE).read_bytes()
+    content, lines = (folder / FRAMES_LOG).read_bytes(), (folder / LOOPS_JSONL).read_bytes()
     (tmp_path / FRAMES_LOG).write_bytes(content[:-5])
     kept = len(edges) - 4
-    (tmp_path / LOOPS_FILE).write_bytes(b"".join(lines.splitlines(True)[:kept]) + lines[:9])  # the next line is cut
+    (tmp_path / LOOPS_JSONL).write_bytes(b"".join(lines.splitlines(True)[:kept]) + lines[:9])  # the next line is cut
     live = opened(params, tmp_path, said)
     missed = live.restore()
     assert len(live) == SCANS - 1 and said.kinds == ["damaged", "recall", "log"]
     found = pairs(live.detector.loops)
     assert kept < len(found) <= len(edges) and found == pairs(edges)[: len(found)]
-    assert pairs(missed) == found[kept:] and pairs(read_loops_jsonl(tmp_path / LOOPS_FILE)) == found
+    assert pairs(missed) == found[kept:] and pairs(read_loops_jsonl(tmp_path / LOOPS_JSONL)) == found
     assert live.names == {f"scan {i}" for i in range(SCANS - 1)}
     live.detector.config = dataclasses.replace(live.detector.config, max_places=9)
     live._forget_results()
@@ -190,10 +191,10 @@ def test_a_map_whose_disk_is_full_starts_again(drive, params, tmp_path, said, mo
     live.add(live_frame(drive, 0))
     assert said.kinds == ["disk"] and said[0][1].endswith("a restart continues after this scan")
     live.close()
-    before = (tmp_path / LOOPS_FILE).stat()
+    before = (tmp_path / LOOPS_JSONL).stat()
     again = opened(params, tmp_path, said)
     assert again.restore() == [] and len(again) == 1
-    assert (tmp_path / LOOPS_FILE).stat().st_ino == before.st_ino  # not written
+    assert (tmp_path / LOOPS_JSONL).stat().st_ino == before.st_ino  # not written
     again.close()
 
 

@@ -30,7 +30,7 @@ def _towns_are_built_once(monkeypatch):
     """Except those of `dataset` and `drive`, which are made before."""
 
     def built(seeds, xy, times, **options):
-        key = seeds, xy.tobytes(), times.tobytes()
+        key = seeds, xy.tobytes(), times.tobytes(), *map(id, options.values())
         return TOWNS.get(key) or TOWNS.setdefault(key, build_world(seeds, xy, times, **options))
 
     monkeypatch.setattr(recording, "build_world", built)

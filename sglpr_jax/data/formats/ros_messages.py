@@ -38,8 +38,6 @@ Most SLAM programs are late by less."""
 MOST_LATE = 0.01
 """Maximum fraction of messages whose header time is before that of an earlier message. More of them show a
 clock that was set back."""
-MOST_OVERTAKEN = 5
-"""Maximum number of successive messages that one message overtakes. More show a clock that was set back."""
 
 
 class Header(NamedTuple):
@@ -225,12 +223,14 @@ class Stamps(NamedTuple):
 
     def headers_are_valid(self, *, most_late: float = 0.0) -> bool:
         """Whether the header times are positive and can be seconds (`times.time_unit_problem`), and at most the
-        fraction `most_late` of them, `MOST_OVERTAKEN` in succession, is before the time of an earlier message."""
+        fraction `most_late` of them is before the time of an earlier message. Two early messages before two late ones
+        show a clock that was set back."""
         if not len(self.header_s) or not (self.header_s > 0).all():
             return False
         is_late = self.header_s < np.maximum.accumulate(self.header_s)
-        successive = np.convolve(is_late, np.ones(MOST_OVERTAKEN + 1), "valid").max(initial=0)
-        if is_late.mean() > most_late or successive > MOST_OVERTAKEN:
+        is_early = self.header_s > np.minimum.accumulate(self.header_s[::-1])[::-1]
+        is_set_back = (is_early[:-3] & is_early[1:-2] & is_late[2:-1] & is_late[3:]).any()
+        if is_late.mean() > most_late or is_set_back:
             return False
         return not time_unit_problem(np.sort(self.header_s), numbers=False)
 
