@@ -24,8 +24,7 @@ from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.loops.comparison import NO_FITS, Fits
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Keyframe
-from sglpr_jax.pose_graph.files import loop_lines, read_loops_jsonl
-from sglpr_jax.pose_graph.folder import LOOPS_JSONL
+from sglpr_jax.pose_graph.files import LOOPS_JSONL, loop_lines, read_loops_jsonl
 from sglpr_jax.pose_graph.incremental import IncrementalTrajectory
 
 FRAMES_LOG = "frames.log"

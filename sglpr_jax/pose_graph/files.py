@@ -24,6 +24,8 @@ from sglpr_jax.loops.odometry_deviation import step_deviations
 from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.se3 import from_quaternions, have_unit_length, inverse, quaternions
 
+LOOPS_JSONL = "loops.jsonl"
+"""File of the loops in an output folder and in a live map."""
 VERTEX, EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
 OTHER_TYPE = re.compile(r"FIX|(VERTEX|EDGE|PARAMS|CACHE)_[A-Z0-9_:]+")
 """First word of a line of g2o: other types than those that are read."""

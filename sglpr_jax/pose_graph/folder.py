@@ -14,10 +14,18 @@ from sglpr_jax.loops.closure import LoopClosure, RejectedClosure, convert_reject
 from sglpr_jax.loops.frame_alignment import TrajectorySegment
 from sglpr_jax.loops.result import LoopSearchResult
 from sglpr_jax.odometry.drift_model import DriftModel
-from sglpr_jax.pose_graph.files import Ids, write_g2o, write_kitti, write_loops_csv, write_loops_jsonl, write_tum
+from sglpr_jax.pose_graph.files import (
+    LOOPS_JSONL,
+    Ids,
+    write_g2o,
+    write_kitti,
+    write_loops_csv,
+    write_loops_jsonl,
+    write_tum,
+)
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory, placements
 
-LOOPS_G2O, LOOPS_JSONL, LOOPS_CSV = "loops.g2o", "loops.jsonl", "loops.csv"
+LOOPS_G2O, LOOPS_CSV = "loops.g2o", "loops.csv"
 REJECTED = "rejected.jsonl"
 FRAMES = "frames.json"
 """File of the transforms between the frames of several sessions."""

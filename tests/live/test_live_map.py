@@ -16,8 +16,7 @@ from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.keyframes import Keyframe
-from sglpr_jax.pose_graph.files import read_loops_jsonl
-from sglpr_jax.pose_graph.folder import LOOPS_JSONL
+from sglpr_jax.pose_graph.files import LOOPS_JSONL, read_loops_jsonl
 from sglpr_jax.registration.bev_search import CorrelationPeak
 from sglpr_jax.se3 import inverse, transform
 from tests.live.conftest import BEGIN, SCANS, live_frame
