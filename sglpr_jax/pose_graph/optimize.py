@@ -257,7 +257,7 @@ def _odometry_deviations(
     path, (query, match), result = DrivenPath(odometry), frames_of(loops), np.zeros(len(loops))
     for session, drift in drifts.items():
         rows = np.flatnonzero((sessions[query] == session) & (sessions[match] == session))
-        result[rows] = deviations([loops[row] for row in rows], path, drift=drift)
+        result[rows] = deviations([loops[row] for row in rows.tolist()], path, drift=drift)
     return result
 
 
