@@ -48,7 +48,7 @@ def read_input(
       trajectory: Positions and times of the frames. If None, only those in the file are used.
       sequence: Name of the sequence, for files that do not contain it.
       distance: Name of the distance between the descriptors of a .npy file, L2 by default. A .npz file has its own.
-      fallback: Used if `trajectory` is None and the .npz file has no positions. Ignored for other files.
+      fallback: Trajectory of a .npz file without positions, if `trajectory` is None. Other files ignore it.
 
     Raises ValueError, with the name of the file, if the file is invalid or does not fit the other arguments.
     """
