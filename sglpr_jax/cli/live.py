@@ -128,8 +128,8 @@ def run_node(
 
 
 def _check_endpoints(command: LiveCommand) -> None:
-    """Raise an error before any work if an endpoint is unknown, --poses would be overwritten or --cloud fails."""
-    from sglpr_jax.live.result_files import CORRECTED, TRAJECTORY
+    """Raise an error before any work if an endpoint is unknown, one would be overwritten or --cloud fails."""
+    from sglpr_jax.live.result_files import RESULTS
     from sglpr_jax.live.sources_and_sinks import SINKS, SOURCES, named_module
 
     name, where, _ = named_module(command.source, SOURCES, kind="sources")
@@ -137,9 +137,11 @@ def _check_endpoints(command: LiveCommand) -> None:
     flag = "--poses" if name == "folder" else "--odometry-topic"
     if unused := [other for other, value in flags.items() if value is not None and other != flag]:
         raise ValueError(f"{command.source}: expected odometry by {flag}, found {unused[0]}")
+    output_files = [(command.out / result).resolve() for result in RESULTS]
     for sink in command.sinks:
-        named_module(sink, SINKS, kind="sinks")
-    output_files = [(command.out / name).resolve() for name in (TRAJECTORY, CORRECTED)]
+        kind, path, _ = named_module(sink, SINKS, kind="sinks")
+        if kind == "json" and path and Path(path).resolve() in output_files:
+            raise ValueError(f"{sink}: expected a file that this run does not overwrite, found an output file")
     if command.poses is not None and command.poses.resolve() in output_files:
         raise ValueError(
             f"{command.poses}: expected odometry that this run does not overwrite, found an output file; "

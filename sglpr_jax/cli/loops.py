@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -203,7 +204,8 @@ def _search_and_write(command: LoopsCommand) -> int:
         )
     if command.degenerate == "drop":
         result = result.without_degenerate()
-    unused = [session.recording.name for session in result.sessions if session.odometry is None]
+    names = zip(result.unique_names, result.sessions, strict=True)
+    unused = [name for name, session in names if session.odometry is None]
     optimized = None
     if command.optimize and not unused:
         print("correcting the trajectory, writing the page", file=sys.stderr)
@@ -237,7 +239,7 @@ def _search_and_write(command: LoopsCommand) -> int:
         viewer = Path(sys.executable).with_name("rerun")
         print(f"{command.rerun}: shown by {viewer} {command.rerun}")
     _print_files(out / PAGE, paths)
-    if (optimized is not None or not command.optimize) and (next_step := _next_step(command)):
+    if (optimized is not None or not command.optimize) and (next_step := _next_step(effective)):
         print(with_installed_names(f"next: {next_step}"), file=sys.stderr)
     if command.open:
         open_page(out / PAGE)
@@ -261,5 +263,8 @@ def _next_step(command: LoopsCommand) -> str:
     if others:
         return ""
     trajectory = command.folder / "trajectory-optimized.tum"
-    seq = f" --seq {command.source.seq}" if command.source.seq else ""
-    return f"bin/map {first}{seq} --poses {trajectory} makes a map in which bin/relocalize finds scans"
+    flags = {"seq": command.source.seq, "poses": trajectory}
+    flags |= {"scale": command.scale} if command.scale != 1 else {}
+    flags |= {"weights": command.weights} if command.weights != DEFAULT_WEIGHTS else {}
+    words = [word for name, value in flags.items() if value for word in (f"--{name}", str(value))]
+    return f"{shlex.join(['bin/map', str(first), *words])} makes a map in which bin/relocalize finds scans"

@@ -83,9 +83,9 @@ def run_peers(command: PeersCommand) -> None:
     with stop_on_signal() as stopped:
         rate = _learning_rate(command, method, data, score, out, stopped)
         settings = RunSettings(rate, seed=command.seed, seconds=command.seconds, images=command.images)
-        record_command(dataclasses.replace(command, learning_rate=rate), out)
         options = {"stopped": stopped, "report": print_error, "progress": progress_bar, "resume": resume}
         run = train_learned(method, data, settings, out, score=score, **options)
+        record_command(dataclasses.replace(command, learning_rate=rate), out)
     print(f"{out}: {run.images} images in {run.seconds:.0f} s", file=sys.stderr)
     if stopped():
         stopped.exit("stopped; continue with --resume")
@@ -108,17 +108,19 @@ def _has_run(out: Path, *, resume: bool) -> bool:
 def _training_inputs(command: PeersCommand, method: "LearnedMethod") -> "tuple[TrainingInputs, HeldOutScore | None]":
     """Prepare the training recordings. Also returns the score on the recordings of --held-out, or None without them."""
     from sglpr_jax.cli.datasets import all_recordings
+    from sglpr_jax.data.fingerprint import fingerprint
     from sglpr_jax.training.peer_inputs import prepare_inputs
     from sglpr_jax.training.peers import HeldOutScore
     from sglpr_jax.training.validation import require_revisits
 
     cache = command.cache or cache_folder() / "peers"
-    if command.held_out is not None and command.held_out.resolve() in {path.resolve() for path in command.data}:
-        raise ValueError(f"--held-out {command.held_out}: expected a dataset other than DATA, found one of them")
     recordings = [recording for root in command.data for recording in all_recordings(root, title="training on")]
     if command.held_out is None:
         return prepare_inputs(method, recordings, cache, progress=progress_bar), None
     held_out = all_recordings(command.held_out, title="held out")
+    trained_on = set(map(fingerprint, recordings))
+    if same := [recording.name for recording in held_out if fingerprint(recording) in trained_on]:
+        raise ValueError(f"--held-out {command.held_out}: expected recordings not in DATA, found {same[0]} in both")
     require_revisits(held_out)
     held_out_inputs = prepare_inputs(method, held_out, cache, progress=progress_bar)
     return prepare_inputs(method, recordings, cache, progress=progress_bar), HeldOutScore(method, held_out_inputs)

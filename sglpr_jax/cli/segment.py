@@ -45,7 +45,7 @@ class SegmentCommand:
 
 
 def segment(command: SegmentCommand) -> None:
-    from sglpr_jax.evaluation.segmentation import segment_recording  # slow imports, not needed for --help
+    from sglpr_jax.evaluation.segmentation import PICTURE, segment_recording  # slow imports, not needed for --help
     from sglpr_jax.files import check_still_there, check_writable, file_name, write_json
     from sglpr_jax.models.weights_file import load
     from sglpr_jax.retrieval.image_maps import save_map
@@ -56,6 +56,8 @@ def segment(command: SegmentCommand) -> None:
         raise ValueError(f"{command.weights}: expected weights with a segmentation head, found none")
     recording = command.source.open(command.data)
     recorded = record_command(command, command.out)
+    for name in (RESULT_FILE, PICTURE):  # scores of an earlier recording
+        (command.out / name).unlink(missing_ok=True)
     labelled_cells = occupied_cells = 0
 
     def write_semantic_map(row: int, scan: "Scan", semantic_map: "SemanticMap") -> None:

@@ -161,9 +161,10 @@ def exit_unless_finished(result: "TrainResult", stopped: StopRequest, *, stop_ad
 def open_recordings(command: TrainCommand) -> "tuple[Sequence[Recording], Sequence[Recording], Recording]":
     """Open the training recordings, those of --also, and the test recording.
 
-    Raises ValueError if --also is --data, or if the test recording lacks what a method of --method needs.
+    Raises ValueError if --also has the tested recording, or if the test recording lacks what a method needs.
     """
     from sglpr_jax.cli.datasets import all_recordings, dataset_root, leave_one_out, without_bad_scans
+    from sglpr_jax.data.fingerprint import fingerprint
     from sglpr_jax.data.scan_stream import require_content
     from sglpr_jax.methods.handcrafted import HANDCRAFTED
 
@@ -173,11 +174,8 @@ def open_recordings(command: TrainCommand) -> "tuple[Sequence[Recording], Sequen
     options = {name: getattr(command, name) for name in ("pose_source", "format", "sensor_height")}
     recordings, test = leave_one_out(roots, command.seq, train_seqs=command.train_seq, **options)
     also = [recording for folder in command.also for recording in all_recordings(folder, **options)]
-    resolved = {root.resolve() for root in roots}
-    if same := [folder for folder in command.also if folder.resolve() in resolved]:
-        raise ValueError(
-            f"--also {same[0]}: expected a dataset other than --data, whose recording {command.seq} is tested"
-        )
+    if fingerprint(test) in map(fingerprint, also):
+        raise ValueError(f"--also: expected datasets without the tested recording {command.seq}, found it in one")
     if command.skip_bad:
         *readable, test = without_bad_scans([*recordings, *also, test], on_bad_scan=report_bad_scan)
         recordings, also = readable[: len(recordings)], readable[len(recordings) :]

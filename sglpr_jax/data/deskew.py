@@ -21,6 +21,8 @@ TICK_S = 2e-5
 degrees a second."""
 WIDEST_S = 1.0
 """Maximum time between two scans with constant velocity between them, in seconds."""
+MOST_APART_S = 10.0
+"""Maximum time between a scan and its points, in seconds."""
 DESKEWED = "deskewed"
 """Name of the read option that describes the trajectory of a deskewed recording."""
 MOST_TRIED = 5
@@ -44,7 +46,8 @@ def deskew(
       pose_times: Times of the poses in seconds, in increasing order.
       world_from_lidar: Poses of the LiDAR in a fixed frame. The velocity between two poses is constant.
 
-    Raises ValueError if there are fewer than two poses or their times do not increase.
+    Raises ValueError if there are fewer than two poses, if their times do not increase, or if the times of the points
+    are not finite, too far from 0 or not one per point.
 
     Example:
       points = sglpr_jax.deskew(points, seconds, time=8.3, pose_times=np.array([8.3, 8.4]), world_from_lidar=poses)
@@ -54,7 +57,13 @@ def deskew(
             f"deskew: expected two poses or more at increasing times, found {len(world_from_lidar)} poses and "
             f"{len(pose_times)} times"
         )
-    ticks = np.rint(np.asarray(point_times, np.float64) / TICK_S).astype(np.int64)
+    seconds = np.asarray(point_times, np.float64)
+    if len(seconds) != len(points) or not (np.abs(seconds) <= MOST_APART_S).all():  # also for NaN
+        raise ValueError(
+            f"deskew: expected for each point its time relative to the scan in seconds, within {MOST_APART_S:g}, found "
+            f"{len(seconds)} times for {len(points)} points, up to {np.abs(seconds).max(initial=0):g}"
+        )
+    ticks = np.rint(seconds / TICK_S).astype(np.int64)
     first = int(ticks.min(initial=0))
     tick_times = time + TICK_S * np.arange(first, int(ticks.max(initial=0)) + 1)
     world_from_tick = poses_at(np.append(tick_times, time), pose_times, world_from_lidar)  # last: the scan's time

@@ -55,9 +55,9 @@ def chosen_scale(recording: Recording) -> Scale:
     for points in sampled_points(recording, SCANS):
         if points is None:
             continue
-        finite = points[np.isfinite(points).all(axis=1)]
-        if len(finite):
-            ranges_m.append(np.quantile(np.hypot(*finite[:, :2].T), 0.9))
+        measured = points[np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)]  # 0: a ray without an echo
+        if len(measured):
+            ranges_m.append(np.quantile(np.hypot(*measured[:, :2].T), 0.9))
     return NEAR_SCALE if ranges_m and np.median(ranges_m) < FAR_M else 1
 
 

@@ -36,6 +36,8 @@ ROW_BITS = 22
 """Number of bits for the row of a point in a sorted key. A submap has at most 4 million points before it is thinned."""
 VOXEL_OFFSET = 2**13
 """Number added to voxel numbers to make them positive. Points farther away than this number of voxels are dropped."""
+NEAREST_M = 0.001
+"""Minimum largest coordinate of a point, in metres. Drivers write zeros for rays without an echo."""
 DISTANCE_BITS = 20
 """Number of bits for a distance in steps of 2 mm, up to 2 km."""
 SUBMAPS = "submaps"
@@ -192,10 +194,11 @@ def _merged(scans: Sequence[Scan], poses: Sequence[Float[np.ndarray, "4 4"]]) ->
 
 
 def _one_point_per_voxel(scan: Scan) -> Scan:
-    """The first point of each voxel. Points that are not finite or more than 819 m away are dropped."""
+    """The first point of each voxel. Points that are not finite, at the sensor or more than 819 m away are dropped."""
     with np.errstate(over="ignore", invalid="ignore"):
-        is_near = (np.abs(scan.cloud) < (VOXEL_OFFSET - 1) * VOXEL_M).all(axis=1)  # False for NaN
-    rows = np.flatnonzero(is_near)
+        largest_m = np.abs(scan.cloud).max(axis=1)
+        is_measured = (largest_m > NEAREST_M) & (largest_m < (VOXEL_OFFSET - 1) * VOXEL_M)  # False for NaN
+    rows = np.flatnonzero(is_measured)
     x, y, z = (np.floor(scan.cloud[rows].T / np.float32(VOXEL_M)) + VOXEL_OFFSET).astype(np.uint64)
     voxels_per_axis = np.uint64(2 * VOXEL_OFFSET)
     return scan.only(rows[_rows_of_smallest((z * voxels_per_axis + y) * voxels_per_axis + x, ignored_bits=0)])

@@ -67,7 +67,8 @@ def take_pictures(
         return Pictures(images, f"Semantic {advice}", f"Feature heat {advice}")
     config = params.config
     semantic_pictures, heat_pictures = [], []
-    for row in sorted({int(fraction * len(recording)) for fraction in SHOWN_SCANS}):
+    rows = list(row_of_frame.values())  # without unreadable scans, which the descriptor file does not have
+    for row in sorted({rows[int(fraction * len(rows))] for fraction in SHOWN_SCANS}):
         caption = f"frame {recording.ids[row]}"
         scan = recording.scan(row, labels=bool(config.categories_read))
         inputs = view(scan, config.grid, categories=config.categories_read, image=config.image)

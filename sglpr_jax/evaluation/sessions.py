@@ -1,6 +1,8 @@
 """Evaluation across sessions: one session is the database, the others are queries, as in table 3 of the paper."""
 
+import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,10 +42,17 @@ def evaluate_sessions(
         with naming(path):
             check_same_method(database_file, file)
     protocols = [PROTOCOLS[name] for name in chosen_protocols("sessions", names)]
+    files = [database_file, *query_files]
+    if len({file.sequence for file in files}) < len(files):
+        for one, other in itertools.combinations(files, 2):
+            if one.sequence == other.sequence and np.array_equal(one.positions, other.positions):
+                sessions = f"database {files[0].sequence}, queries {', '.join(file.sequence for file in files[1:])}"
+                raise ValueError(f"expected different sessions, found {sessions}")
+        # Recordings of several datasets may have one name, such as 00. The names of their files differ.
+        paths = (database, *queries)
+        files = [replace(file, sequence=str(path.with_suffix(""))) for path, file in zip(paths, files, strict=True)]
+    database_file, *query_files = files
     database_name, query_names = database_file.sequence, [file.sequence for file in query_files]
-    if len({database_name, *query_names}) < 1 + len(query_names):
-        sessions = f"database {database_name}, queries {', '.join(query_names)}"
-        raise ValueError(f"expected different sessions, found {sessions}")
     for file in query_files:
         _check_overlap(database_file, file)
     width = database_file.descriptors.shape[1]

@@ -69,7 +69,7 @@ class BagSource:
         pose = None if self._poses is None else self._poses[row]
         stamp = 0.0 if self._recording.times is None else float(self._recording.times[row])
         scan = dataclasses.replace(scan, name=self._scan_name(row))
-        return LiveFrame(scan, time=stamp, odometry=pose, received=time.monotonic())
+        return LiveFrame(scan, time=stamp, odometry=pose, received=time.monotonic(), is_recorded=True)
 
     def _scan_name(self, row: int) -> str:
         return f"{self._root}, scan {self._recording.ids[row]}"

@@ -33,6 +33,8 @@ class LiveFrame(NamedTuple):
     """Pose of the LiDAR by odometry (`world_from_lidar`), or None if it is unknown."""
     received: float
     """Time at which the scan arrived, by `time.monotonic()`, in seconds."""
+    is_recorded: bool = False
+    """Whether `time` is that of a recording, in which a long pause is no change of the clock."""
 
 
 class FrameStatus(NamedTuple):

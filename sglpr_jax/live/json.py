@@ -54,7 +54,8 @@ def open_sink(where: str, options: LiveOptions, report: Report) -> JsonLines:
     if not where:
         return JsonLines(sys.stdout)
     path = Path(where)
-    with raising_write_error(path):
+    with raising_write_error(path, path, *path.parents):
+        path.parent.mkdir(parents=True, exist_ok=True)
         file = path.open("a", encoding="utf-8")
         if _ends_within_line(path):
             print(file=file, flush=True)

@@ -205,7 +205,7 @@ class LiveMap:
         if scan.mounting is None:
             scan = dataclasses.replace(scan, mounting=self._mounting.add(scan.points))
         finder = self.detector.finder
-        scan_time = self._clock.time(frame.time, frame.received)
+        scan_time = self._clock.time(frame.time, frame.received, is_recorded=frame.is_recorded)
         state = self._continuity.add(pose, scan_time)
         if state is None:
             return None

@@ -9,7 +9,6 @@ from jaxtyping import Float, Float32
 from sglpr_jax.data.choices import SensorHeight
 from sglpr_jax.data.mounting import Mounting, common_mounting, estimate_mounting
 from sglpr_jax.live.data_types import Report
-from sglpr_jax.se3 import inverse
 
 JUMP_S = 60.0
 """Maximum lead of a header's time over the time since the last scan, in seconds. Beyond it, the clock changed."""
@@ -20,7 +19,8 @@ FASTEST_M_PER_S, SLACK_M = 60.0, 1.0
 RESTART_S = 60.0
 """Maximum time without a scan after which the odometry may continue, in seconds."""
 RESET_M = 0.2
-"""Radius about the origin, in metres. Odometry that jumps into it by more than five times this distance was reset."""
+"""Radius about the origin and about the first pose, in metres. Odometry was reset if it jumps into the radius by more
+than five times this distance, unless the step continues the one before."""
 HOLD_S = 2.0
 """Maximum time without odometry, in seconds, for which scans that show no motion are left out. The first such scan is
 always left out."""
@@ -50,6 +50,8 @@ class OdometryContinuity:
         self._began: float | None = None  # time of the first scan, in seconds
         self._last: Float[np.ndarray, "4 4"] | None = None  # last pose by odometry
         self._last_time = 0.0  # time of `_last`, in seconds
+        self._first_m = np.zeros(3)  # position of the first pose of the odometry frame
+        self._velocity = np.zeros(3)  # of the last step, in metres per second
         self._is_known = True  # whether the motion up to the last scan before a restart is known
         self._misses_pose = False  # whether the last scan had no pose
         self._resumed = False  # whether the next scan is the first one after a restart
@@ -86,6 +88,10 @@ class OdometryContinuity:
                 self._report("restart", f"{message} after the restart")
             else:
                 self._report("jump", message)
+        if self._last is None or not continues:
+            self._first_m, self._velocity = pose[:3, 3], np.zeros(3)
+        else:
+            self._velocity = (pose - self._last)[:3, 3] / max(time - self._last_time, 1e-9)
         self._last, self._last_time, self._is_known, self._misses_pose = pose, time, True, False
         return OdometryState(pose, continues)
 
@@ -103,11 +109,14 @@ class OdometryContinuity:
         return False
 
     def _is_plausible(self, pose: Float[np.ndarray, "4 4"], time: float, resumed: bool) -> bool:
-        """Whether a pose can follow the last one: near enough, not reset to the origin, not after a long restart."""
+        """Whether a pose can follow the last one: near enough, not reset, not after a long restart."""
         assert self._last is not None
         passed_s = time - self._last_time
-        moved = float(np.linalg.norm((inverse(self._last) @ pose)[:3, 3]))
-        is_reset = float(np.linalg.norm(pose[:3, 3])) < RESET_M and moved > 5 * RESET_M
+        position_m, step_m = pose[:3, 3], (pose - self._last)[:3, 3]
+        moved = float(np.linalg.norm(step_m))
+        is_at_begin = min(np.linalg.norm(position_m), np.linalg.norm(position_m - self._first_m)) < RESET_M
+        moves_on = np.linalg.norm(step_m - self._velocity * passed_s) < moved / 2
+        is_reset = is_at_begin and moved > 5 * RESET_M and not moves_on
         is_near = moved <= SLACK_M + FASTEST_M_PER_S * passed_s
         return is_near and not is_reset and (not resumed or passed_s <= RESTART_S)
 
@@ -128,15 +137,16 @@ class ScanClock:
         self._last, self._received = time, received
         self._offset = time - stamp if _is_time(stamp) else 0.0
 
-    def time(self, stamp: float, received: float) -> float:
-        """Return the time of the next scan, in seconds, from its header time and its time of arrival."""
+    def time(self, stamp: float, received: float, *, is_recorded: bool = False) -> float:
+        """Return the time of the next scan, in seconds, from its header time and its time of arrival. In a recording,
+        which may be replayed faster, a header may be any time later than the one before."""
         passed_s = max(received - self._received, 0.0)
         expected = received if self._last is None else self._last + passed_s
         time, doubtful = stamp + self._offset, None
         if not _is_time(stamp):
             self._report("time", f"expected the time of a scan in its header, found {stamp:g}; its arrival is used")
             time = expected
-        elif self._last is not None and not self._last <= time <= expected + JUMP_S:
+        elif self._last is not None and not self._last <= time <= expected + (math.inf if is_recorded else JUMP_S):
             step = f"expected a scan about {passed_s:.1f} s after the last one, found {time - self._last:+.1f} s"
             if self._doubtful is not None and 0 <= stamp - self._doubtful <= passed_s + JUMP_S:
                 self._report("clock", f"{step} in its header; from now on times are counted from its arrival")

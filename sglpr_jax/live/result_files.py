@@ -7,10 +7,12 @@ import numpy as np
 
 from sglpr_jax.files import write_all
 from sglpr_jax.live.live_map import LiveMap
-from sglpr_jax.pose_graph.files import write_tum
-from sglpr_jax.pose_graph.folder import graph_files
+from sglpr_jax.pose_graph.files import LOOPS_JSONL, write_tum
+from sglpr_jax.pose_graph.folder import LOOPS_CSV, LOOPS_G2O, REJECTED, graph_files
 
 TRAJECTORY, CORRECTED = "trajectory.tum", "trajectory-optimized.tum"
+RESULTS = (LOOPS_JSONL, LOOPS_G2O, LOOPS_CSV, REJECTED, TRAJECTORY, CORRECTED)
+"""Names of all files of `write_results`."""
 
 
 def write_results(live: LiveMap, folder: Path) -> list[Path]:

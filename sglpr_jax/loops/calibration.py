@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from sglpr_jax.bev import even_cells, rotate_image
 from sglpr_jax.data.poses import as_scan_poses
@@ -16,7 +16,7 @@ from sglpr_jax.data.scan_stream import scan_stream
 from sglpr_jax.data.views import picture, rotated
 from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.comparison import Candidate, KeyframeComparison, Query
-from sglpr_jax.loops.keyframes import StoredScans
+from sglpr_jax.loops.keyframes import Keyframe, StoredScans
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model, recalibrated
 from sglpr_jax.models.weights import Params
 from sglpr_jax.odometry.bev_odometry import BevOdometry
@@ -145,7 +145,7 @@ class _Drive:
         self.stored = StoredScans(self.finder.index)
         for row, keyframe in scan_stream(recording, lambda row, scan: self.finder.keyframe(scan)):
             assert keyframe is not None  # the stream raises the error of a bad scan
-            self.stored.add(row, keyframe.descriptor, np.asarray(within_reach(keyframe.image)))
+            self.stored.add(row, keyframe.descriptor, self._foreground(keyframe))
         self.comparer = KeyframeComparison(self.motion, DriftModel())
 
     def pair(self, frame: int, angle: float, *, positive: bool) -> Candidate | None:
@@ -174,4 +174,8 @@ class _Drive:
             even_image = even_cells(jnp.asarray(picture(scan, None)[0]))
             rotated_scan = Scan(image=np.asarray(rotate_image(even_image, jnp.float32(angle))))
         keyframe = self.finder.keyframe(rotated_scan)
-        return Query(len(self.motion) - 1, keyframe.descriptor, np.asarray(within_reach(keyframe.image)))
+        return Query(len(self.motion) - 1, keyframe.descriptor, self._foreground(keyframe))
+
+    def _foreground(self, keyframe: Keyframe) -> UInt8[np.ndarray, "m m"]:
+        """Central part of an image without the rings of the background, as in a search."""
+        return self.finder.background.without(np.asarray(within_reach(keyframe.image)))

@@ -67,6 +67,7 @@ class CandidateSearch:
         self.fits = NO_FITS
         """Comparisons of the last frame."""
         self.has_odometry = False
+        self._heights_m = np.inf, -np.inf  # lowest and highest position of the LiDAR by odometry
         """Whether the frames have poses from odometry. If so, `motion` holds them."""
         self.motion = BevOdometry()
         """Motion of the sensor over all frames."""
@@ -124,7 +125,8 @@ class CandidateSearch:
     @property
     def knows_height(self) -> bool:
         """Whether there is odometry that measures height. That of wheels does not."""
-        return self.has_odometry and float(np.ptp(self.motion.path.poses[:, 2, 3])) > FLAT_M
+        lowest_m, highest_m = self._heights_m
+        return self.has_odometry and highest_m - lowest_m > FLAT_M
 
     def keyframe(self, scan: Scan) -> Keyframe:
         """Compute descriptor and 8-bit density image of a scan or image (`describe_scan`). Nothing is stored."""
@@ -303,6 +305,9 @@ class CandidateSearch:
         pose = None if odometry is None else np.asarray(odometry, np.float64) @ inverse(to_upright)
         time = self._time_of_scan(time)
         self.has_odometry = pose is not None
+        if odometry is not None:  # without the mounting, whose height may be estimated for each scan
+            height_m, (lowest_m, highest_m) = float(odometry[2, 3]), self._heights_m
+            self._heights_m = min(lowest_m, height_m), max(highest_m, height_m)
         if not continues:
             self.odometry_check.restart()
         if pose is not None:

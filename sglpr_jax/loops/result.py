@@ -180,8 +180,8 @@ def diagnose_no_loops(result: LoopSearchResult) -> list[str]:
     """Explain why sessions have no loops, one sentence for each reason, with the name of its session if several."""
     if len(result.sessions) != 1:
         sentences = []
-        for number, session in enumerate(result.sessions):
-            sentences += [f"{session.recording.name}: {line}" for line in diagnose_no_loops(result.within(number))]
+        for number, name in enumerate(result.unique_names):
+            sentences += [f"{name}: {line}" for line in diagnose_no_loops(result.within(number))]
         return sentences
     if result.loops:
         return []

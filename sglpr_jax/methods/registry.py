@@ -45,7 +45,8 @@ def method_beside(trained: Params, name: str, *, ready_made: bool, seed: int) ->
     method makes images on the grid of the trained network. It does not crop `ready_made` images.
     """
     if name == UNTRAINED:
-        return network(init(jax.random.key(seed + 1), config=trained.config))
+        config = dataclasses.replace(trained.config, descriptors_of="")  # random weights have learned from no teacher
+        return network(init(jax.random.key(seed + 1), config=config))
     if name == SHIPPED:
         return network(load(DEFAULT_WEIGHTS))
     return handcrafted(name, None if ready_made else trained.config.grid)
@@ -64,11 +65,19 @@ def trained_method(method: LearnedMethod, weights: str) -> Method:
     return Method(
         about={"method": method.name, "weights": weights},
         takes=method.takes,
-        prepare=lambda scan, angle: method.prepare(scan if angle is None else rotated_scan(scan, angle)),
+        prepare=functools.partial(_learned_input, method),
         describe=functools.partial(apply_network, variables, method=method),
         distance="l2" if method.compare is None else name_of_distance(method.name, weights, sha256),
         weights_hash=sha256,
     )
+
+
+def _learned_input(method: LearnedMethod, scan: Scan, angle: float | None) -> np.ndarray:
+    """Return the input of a scan rotated by `angle`. Raises ValueError if it is empty: all empty ones look alike."""
+    inputs = method.prepare(scan if angle is None else rotated_scan(scan, angle))
+    if not inputs.any():
+        raise ValueError(f"{scan.name}: expected points or pixels that {method.name} reads, found none")
+    return inputs
 
 
 def network(params: Params) -> Method:

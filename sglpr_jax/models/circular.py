@@ -78,6 +78,8 @@ class CircularDecoder(nn.Module):
 def block_means(x: Float[Array, "b r s c"], radii: int, sectors: int) -> Float[Array, "b _ _ c"]:
     """Average blocks of `radii` x `sectors` pixels. Radii come first, then sectors, so that no array has six axes."""
     b, r, s, c = x.shape
+    if r % radii or s % sectors:
+        raise ValueError(f"means: expected a polar map that {radii} x {sectors} pixels tile, found {r} x {s} pixels")
     over_radii = _mean_of_parts(x.reshape(b, r // radii, radii * s * c), radii)
     blocks = _mean_of_parts(over_radii.reshape(b, r // radii * (s // sectors), sectors * c), sectors)
     return blocks.reshape(b, r // radii, s // sectors, c)

@@ -19,6 +19,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled, scaled_poses
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable, scan_stream
+from sglpr_jax.data.times import usual_step
 from sglpr_jax.extras import optional_module
 from sglpr_jax.files import warn
 from sglpr_jax.frame_log import FrameLog
@@ -82,7 +83,7 @@ def scan_odometry(
         logged = {row: np.frombuffer(record) for row in rows if (record := log.record(row)) is not None}
         if len(logged) < len(recording):
             options = {"on_bad_scan": on_bad_scan, "should_stop": should_stop, "on_progress": on_progress}
-            results = _register_scans(recording, log, logged, _FrontEnd(config), scale, **options)
+            results = _register_scans(recording, log, logged, _FrontEnd(config, _steps(recording)), scale, **options)
         else:
             results = np.array([logged[row] for row in range(len(recording))])
     last_point_s, points, overlap = results[:, 16:].T
@@ -95,8 +96,19 @@ def scan_odometry(
 def _settings(recording: Recording, config: OdometryConfig, scale: Scale) -> dict[str, Any]:
     """Settings that determine the records. A log with other settings is not resumed."""
     scans = [recording.name, fingerprint(recording, contents="some")]
-    versions = {"kiss-icp": version("kiss-icp"), "record length": RESULT_NUMBERS}
+    versions = {"kiss-icp": version("kiss-icp"), "record length": RESULT_NUMBERS, "guess": "velocity"}
     return {"scans": scans, **versions, "scale": scale, **dataclasses.asdict(config)}
+
+
+def _steps(recording: Recording) -> Float[np.ndarray, " n"]:
+    """Time from the previous scan to each scan, in seconds, or 1 without increasing times.
+
+    Times of a receiver may come in bursts, so a step is at least as long as the usual one.
+    """
+    times = recording.times
+    if times is None or not (np.diff(times) > 0).all() or len(times) < 2:
+        return np.ones(len(recording))
+    return np.maximum(np.diff(times, prepend=times[0]), usual_step(times))
 
 
 def _register_scans(
@@ -115,7 +127,8 @@ def _register_scans(
     results = list[np.ndarray]()
     for row, cloud in scan_stream(scaled(recording, scale), lambda _, scan: _cloud(scan, is_timed), **options):
         known = logged.get(row)
-        pose, points, overlap = front_end.add(cloud, known_pose=None if known is None else known[:16].reshape(4, 4))
+        known_pose = None if known is None else known[:16].reshape(4, 4)
+        pose, points, overlap = front_end.add(row, cloud, known_pose=known_pose)
         if known is None:
             last_point_s, points = (0.0, np.nan) if cloud is None else (cloud[1].max(initial=0), points)
             known = np.append(pose, [last_point_s, points, overlap])
@@ -136,26 +149,30 @@ def _cloud(scan: Scan, is_timed: bool) -> Cloud:
 class _FrontEnd:
     """kiss-icp, to which scans are added one after the other."""
 
-    def __init__(self, config: OdometryConfig):
+    def __init__(self, config: OdometryConfig, steps: Float[np.ndarray, " n"]):
+        """Begin a recording. `steps` are the times from one scan to the next, in any unit if points have no times."""
         data = {"max_range": config.max_range_m, "min_range": config.min_range_m, "deskew": True}
         mapping = {"voxel_size": config.used_voxel_m}
         settings = importlib.import_module("kiss_icp.config").KISSConfig(data=data, mapping=mapping)
         self._icp, self._voxel_m = check_installed().KissICP(settings), config.used_voxel_m
+        self._steps, self._last_step = steps, float(steps.max(initial=1.0))
         self._previous_clouds: deque[Float[np.ndarray, "n 3"]] = deque(maxlen=PREVIOUS)
         """Points of the previous scans in the frame of the first scan."""
 
     def add(
-        self, cloud: Cloud | None, *, known_pose: Float[np.ndarray, "4 4"] | None = None
+        self, row: int, cloud: Cloud | None, *, known_pose: Float[np.ndarray, "4 4"] | None = None
     ) -> tuple[Float[np.ndarray, "4 4"], int, float]:
         """Register the next scan, or add it at its known pose. Without a scan or with few points, extrapolate.
 
-        These are the steps of kiss-icp's `register_frame`, which takes no known pose. Returns the pose, the number of
-        points after downsampling, and the result of `_overlap`.
+        These are the steps of kiss-icp's `register_frame`, which takes no known pose and assumes that all steps take
+        as long as a sweep. Returns the pose, the number of points after downsampling, and the result of `_overlap`.
         """
-        icp, guess = self._icp, self._icp.last_pose @ self._icp.last_delta
+        icp, step = self._icp, float(self._steps[row])
+        guess = icp.last_pose @ self._motion_in(step)
         source, mapped = np.zeros((0, 3)), np.zeros((0, 3))
         if cloud is not None:
-            source, mapped = icp.voxelize(icp.preprocessor.preprocess(*cloud, icp.last_delta))
+            sweep = float(np.ptp(cloud[1])) if cloud[1].size else 0.0
+            source, mapped = icp.voxelize(icp.preprocessor.preprocess(*cloud, self._motion_in(sweep)))
         if len(source) < MIN_POINTS:
             icp.last_pose = guess
             return guess, len(source), 1.0
@@ -171,9 +188,14 @@ class _FrontEnd:
             )
         icp.adaptive_threshold.update_model_deviation(np.linalg.inv(guess) @ pose)
         icp.local_map.update(mapped, pose)
-        icp.last_delta = np.linalg.inv(icp.last_pose) @ pose
+        icp.last_delta, self._last_step = np.linalg.inv(icp.last_pose) @ pose, step
         icp.last_pose = pose
         return pose, len(source), self._overlap(source, mapped, pose)
+
+    def _motion_in(self, time: float) -> Float[np.ndarray, "4 4"]:
+        """Motion in this time at the velocity of the last step."""
+        steps = np.array([0.0, self._last_step])
+        return poses_at(np.array([time]), steps, np.stack([np.eye(4), self._icp.last_delta]))[0]
 
     def _overlap(self, source: np.ndarray, mapped: np.ndarray, pose: np.ndarray) -> float:
         """Share of `source` with a point of the previous scans within a voxel. 1 for the first scans.

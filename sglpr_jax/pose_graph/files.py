@@ -170,16 +170,6 @@ def write_loops_csv(path: Path | str, loops: Sequence[LoopClosure], recordings: 
     write_text(Path(path), text.getvalue())
 
 
-def write_loops_jsonl(
-    path: Path | str,
-    loops: Sequence[LoopClosure | RejectedClosure],
-    ids: Ids | None = None,
-    recordings: Ids | None = None,
-) -> None:
-    """Write loops or rejected pairs, one JSON object a line (`loop_lines`)."""
-    write_text(Path(path), loop_lines(loops, ids, recordings))
-
-
 def loop_lines(
     loops: Sequence[LoopClosure | RejectedClosure], ids: Ids | None = None, recordings: Ids | None = None
 ) -> str:
@@ -203,7 +193,7 @@ def loop_lines(
 
 
 def read_loops_jsonl(path: Path | str, *, skip_damaged: bool = False) -> list[LoopClosure]:
-    """Read the loops of a file of `write_loops_jsonl`. Raises FileNotFoundError, or ValueError, which names the line,
+    """Read the loops of a file of `loop_lines`. Raises FileNotFoundError, or ValueError, which names the line,
     if a line is not a valid loop. With `skip_damaged`, such a line is left out."""
     path = Path(path)
     if not path.is_file():

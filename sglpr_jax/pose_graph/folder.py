@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from sglpr_jax.files import file_name, text_bytes, warn, write_all, write_json
+from sglpr_jax.files import file_name, text_bytes, warn, write_all, write_json, write_text
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure, convert_rejected, renumbered
 from sglpr_jax.loops.frame_alignment import TrajectorySegment
 from sglpr_jax.loops.result import LoopSearchResult
@@ -17,10 +17,10 @@ from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.pose_graph.files import (
     LOOPS_JSONL,
     Ids,
+    loop_lines,
     write_g2o,
     write_kitti,
     write_loops_csv,
-    write_loops_jsonl,
     write_tum,
 )
 from sglpr_jax.pose_graph.optimize import OptimizedTrajectory, placements
@@ -112,8 +112,8 @@ def graph_files(
     return {
         LOOPS_G2O: partial(write_g2o, loops=loops, chains=chains, comments=comments),
         LOOPS_CSV: partial(write_loops_csv, loops=loops, recordings=recordings),
-        REJECTED: partial(write_loops_jsonl, loops=rejected, ids=ids, recordings=recordings),
-        LOOPS_JSONL: partial(write_loops_jsonl, loops=loops, ids=ids, recordings=recordings),
+        REJECTED: partial(write_text, text=loop_lines(rejected, ids, recordings)),
+        LOOPS_JSONL: partial(write_text, text=loop_lines(loops, ids, recordings)),
     }
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import jax
 
-from sglpr_jax.data.readers import recording_names
+from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import require_content
 from sglpr_jax.methods.registry import handcrafted, method_with_weights
@@ -46,9 +46,12 @@ def check_inputs(reproduction: Reproduction, names: Sequence[str], nclt: Path | 
         if reproduction.recording(seq).positions is None:
             raise ValueError(f"{data}: sequence {seq} has no poses; training and scoring need them")
     if nclt is not None and any(experiment.across_sessions for experiment in experiments.values()):
-        sessions = recording_names(nclt)  # the first is the database, the others are queries
+        sessions = [open_recording(nclt, name) for name in recording_names(nclt)]  # the first is the database
         if len(sessions) < 2:
-            raise ValueError(f"{nclt}: expected two sessions or more, found {', '.join(sessions)}")
+            raise ValueError(f"{nclt}: expected two sessions or more, found {', '.join(one.name for one in sessions)}")
+        for session in sessions:
+            if session.positions is None:
+                raise ValueError(f"{nclt}: session {session.name} has no poses; scoring needs them")
     for name in reproduction.weights:
         method_with_weights(name)  # raises an error if the weights are missing or damaged
     for name, experiment in experiments.items():

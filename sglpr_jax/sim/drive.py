@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.data.formats.pose_files import read_kitti, read_times
+from sglpr_jax.data.formats.pose_files import read_kitti, read_times, warn_of_heights
 from sglpr_jax.se3 import lengths_along, yaw_of
 from sglpr_jax.sim import RATE_HZ
 from sglpr_jax.sim.ground import Relief, relief_gradient, relief_height
@@ -100,8 +100,9 @@ def read_path(file: Path) -> PlanarPath:
     poses = read_kitti(file)
     if len(poses) < 2:
         raise ValueError(f"{file}: expected 2 poses or more, 12 numbers a line, found {len(poses)}")
+    warn_of_heights(poses[:, :3, 3], source=file)
     times_file = file.parent / "times.txt"
-    times = read_times(times_file, unit="s") if times_file.is_file() else None
+    times = read_times(times_file) if times_file.is_file() else None
     times = np.arange(len(poses)) / 10 if times is None else times
     if len(times) != len(poses):
         raise ValueError(f"{times_file}: expected {len(poses)} times, one per pose of {file.name}, found {len(times)}")

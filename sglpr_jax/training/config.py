@@ -157,6 +157,13 @@ class TrainConfig:
             )
         if self.loss.segmentation_alone and not self.model.segments:
             raise ValueError("loss.segmentation_alone: expected a model with a segmentation head, found one without")
+        triplet_tuples = self.tuples if self.also_triplets else self.tuples - self.also_tuples
+        has_negatives = self.sampling.negatives > 0 or (self.share_negatives and triplet_tuples > 1)
+        if self.needs_negatives and not has_negatives:
+            raise ValueError(
+                "the triplet loss has no negatives: expected sampling.negatives above 0, or share_negatives and "
+                f"several tuples, found {self.sampling.negatives}, {self.share_negatives} and {triplet_tuples}"
+            )
         if self.chunk and self.images % self.chunk:
             raise ValueError(f"chunk must divide the {self.images} images of a step, found {self.chunk}")
         if self.images_at_once % self.loss.segment_every:
@@ -164,6 +171,11 @@ class TrainConfig:
                 f"loss.segment_every must divide the {self.images_at_once} images of a chunk, "
                 f"found {self.loss.segment_every}"
             )
+
+    @property
+    def needs_negatives(self) -> bool:
+        """Whether the loss compares places with places elsewhere."""
+        return not (self.loss.teacher or self.loss.segmentation_alone)
 
     @property
     def images(self) -> int:

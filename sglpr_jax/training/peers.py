@@ -179,9 +179,9 @@ def train_learned(
     del recipe["learning_rates"]  # the settings have the learning rate of this run
     recordings = [{"name": recording.name, "scans": len(recording)} for recording in data.recordings]
     config = {"method": method.name, "settings": settings_json, "recipe": recipe, "recordings": recordings}
+    pool = tuple_pool(data.recordings, method.recipe.sampling)  # may raise, before the folder becomes a run
     lock = lock_run(out, config, seed=settings.seed, resume=resume, limits=LIMITS)
     with lock, progress(f"train {method.name}", math.ceil(settings.seconds)) as show:
-        pool = tuple_pool(data.recordings, method.recipe.sampling)
         trainer = Trainer(
             network,
             _peer_batches(network, data, pool, out),

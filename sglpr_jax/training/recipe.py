@@ -200,6 +200,11 @@ def _batches_and_score(
     """Return batches of the training places, and a score, on held-out places or, without them, on training places."""
     splits = split_recordings(recordings, config)
     pool = tuple_pool(recordings, config.sampling, frames=[training for training, _ in splits])
+    if config.needs_negatives and not (also and config.also_triplets) and not pool.has_negatives:
+        raise ValueError(
+            f"expected places farther apart than sampling.negative_m, {config.sampling.negative_m} m, as negatives, "
+            "found none; in a small place, reduce it"
+        )
 
     def describe(state: TrainState, places: Int[np.ndarray, "n"]) -> Float32[np.ndarray, "n d"]:
         return describe_places(state.params, recordings, pool, places, np.zeros(len(places)), config)

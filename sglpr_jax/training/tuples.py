@@ -85,6 +85,12 @@ class TuplePool:
     def __len__(self) -> int:
         return len(self.frame_of)
 
+    @property
+    def has_negatives(self) -> bool:
+        """Whether any place is far enough from another one to be its negative."""
+        places = np.arange(len(self))
+        return any(self.far_apart(places[place], places).any() for place in places)
+
     def draw(
         self, *, seed: int, step: int, tuples: int, cache: DescriptorCache | None = None
     ) -> Int[np.ndarray, "{tuples} k"]:

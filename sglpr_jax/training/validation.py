@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float32, Int
+from jaxtyping import Array, Float, Float32, Int
 from scipy.spatial.distance import cdist
 
 from sglpr_jax.data.recording import Recording
@@ -75,11 +75,10 @@ def validation_score(
 
     def score(params: Params) -> dict[str, float]:
         descriptors = describe_places(params, recordings, pool, places, angles, config)
-        neighbours, _ = recall_and_f1_max(descriptors, pool, np.eye(len(pool), dtype=bool))
+        neighbours, _ = recall_and_f1_max(descriptors, pool)
         if not len(pool.revisits.anchors):
             return {"score": neighbours, "recall_neighbours": neighbours}
-        same_visit = pool.are_of_one_visit(places[:, None], places[None])
-        revisits, f1_max = recall_and_f1_max(descriptors, pool, same_visit)
+        revisits, f1_max = recall_and_f1_max(descriptors, pool, revisits_only=True)
         score = (revisits + f1_max) / 2
         return {"score": score, "recall_neighbours": neighbours, "recall_revisits": revisits, "f1max": f1_max}
 
@@ -87,25 +86,30 @@ def validation_score(
 
 
 def recall_and_f1_max(
-    descriptors: Float32[np.ndarray, "n d"], pool: TuplePool, excluded: Bool[np.ndarray, "n n"]
+    descriptors: Float32[np.ndarray, "n d"], pool: TuplePool, *, revisits_only: bool = False
 ) -> tuple[float, float]:
     """Return Recall@1 and top-1 F1max. Every place of the pool is a query, and `descriptors` are those of its places.
 
-    The database of a query has all places that its row in `excluded` does not exclude. A match is in the same world and
-    within the positive distance. Recall@1 counts queries with a match; there must be at least one. F1max accepts the
-    nearest place up to a threshold on the descriptor distance: a match is right, a place beyond the negative distance
-    is wrong.
+    The database of a query has all other places or, with `revisits_only`, those of other visits. A match is in the same
+    world and within the positive distance. Recall@1 counts queries with a match; there must be at least one. F1max
+    accepts the nearest place up to a threshold on the descriptor distance: a match is right, a place beyond the
+    negative distance is wrong.
     """
-    queries = np.arange(len(pool))
-    is_match = ~excluded & (cdist(pool.separated, pool.separated) < pool.config.positive_m)  # (query, place)
-    descriptor_distance = np.where(excluded, np.inf, cdist(descriptors, descriptors))
-    nearest = descriptor_distance.argmin(1)
-    nearest_is_match = is_match[queries, nearest]
-    has_match = np.asarray(is_match.any(1))
+    places = np.arange(len(pool))
+    nearest, distance = np.zeros_like(places), np.zeros(len(pool))
+    nearest_is_match, has_match = np.zeros((2, len(pool)), bool)
+    for start in range(0, len(pool), QUERIES):
+        rows = slice(start, start + QUERIES)
+        queries = places[rows, None]
+        excluded = pool.are_of_one_visit(queries, places[None]) if revisits_only else queries == places[None]
+        is_match = ~excluded & (cdist(pool.separated[rows], pool.separated) < pool.config.positive_m)  # (query, place)
+        distances = np.where(excluded, np.inf, cdist(descriptors[rows], descriptors))
+        nearest[rows], distance[rows], has_match[rows] = distances.argmin(1), distances.min(1), is_match.any(1)
+        nearest_is_match[rows] = np.take_along_axis(is_match, nearest[rows, None], axis=1)[:, 0]
     curve = decision_curve(
-        -descriptor_distance[queries, nearest],
+        -distance,
         true_if_accepted=nearest_is_match,
-        false_if_accepted=pool.far_apart(queries, nearest),
+        false_if_accepted=pool.far_apart(places, nearest),
         missed_if_rejected=has_match,
     )
     return float(nearest_is_match[has_match].mean()), curve.f1_max

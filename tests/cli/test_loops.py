@@ -3,6 +3,8 @@ import json
 import numpy as np
 import pytest
 
+from sglpr_jax.cli.loops import LoopsCommand, _next_step
+from sglpr_jax.cli.recording import CloudOptions
 from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
 from sglpr_jax.loops import search
 from sglpr_jax.loops.closure import LoopClosure, RejectedClosure
@@ -24,6 +26,13 @@ def odometry(town) -> np.ndarray:
 
 
 @pytest.mark.slow
+def test_the_next_step_keeps_the_scale_and_quotes_paths(tmp_path):
+    output = CloudOptions(cloud=tmp_path / "c.ply")
+    command = LoopsCommand((tmp_path / "my scans",), odometry="auto", optimize=True, scale=4, output=output)
+    said = _next_step(command)
+    assert said.startswith(f"bin/map '{tmp_path}/my scans' --poses ") and " --scale 4 makes a map" in said
+
+
 def test_bin_loops_writes_the_files_and_page_of_the_library(command, walk, tmp_path, monkeypatch):
     found, find_loops = [], search.find_loops
     monkeypatch.setattr(

@@ -57,6 +57,12 @@ def test_a_finished_run_resumes_without_steps_and_is_not_overwritten(run):
     assert run_command(*again, "--resume").status == 0
     assert read_metrics(run / "metrics.jsonl") == before
     assert_one_line_error(run_command(*again, "--resume", "--seed", 1), "settings.seed")
+    assert json.loads((run / "command.json").read_text())["seed"] == 0
+
+
+def test_a_held_out_recording_inside_the_training_data_is_an_error(town, tmp_path):
+    ended = run_command("peers", "train", "rinet", town, "--out", tmp_path / "run", "--held-out", town)
+    assert_one_line_error(ended, "expected recordings not in DATA, found")
 
 
 def test_trained_weights_describe_a_recording_and_compare_it(run, town, tmp_path):

@@ -41,7 +41,7 @@ def pixels(path) -> np.ndarray:
         return np.asarray(image)
 
 
-def test_images_get_label_maps_that_lie_on_them(segment, trained, labelled_images):
+def test_images_get_label_maps_that_lie_on_them(segment, trained, labelled_images, images):
     ended, maps = segment("--weights", trained.folder, "--data", labelled_images, "--seq", "06")
     assert ended.status == 0, ended.error
     for frame in range(30):
@@ -53,6 +53,8 @@ def test_images_get_label_maps_that_lie_on_them(segment, trained, labelled_image
         assert set(np.unique(found)) <= set(RAW_NAMES)
     scores = json.loads((maps / "segmentation.json").read_text())
     assert {name for name, share in scores["shares"].items() if share} == {"car", "building"}
+    ended, maps = segment("--weights", trained.folder, "--data", images, "--seq", "06")
+    assert ended.status == 0 and not (maps / "segmentation.json").exists()  # scores of the other recording
 
 
 def test_cells_below_the_minimum_confidence_are_unlabelled(segment, trained, images):

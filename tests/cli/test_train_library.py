@@ -72,6 +72,12 @@ def test_recordings_that_cannot_be_trained_on_are_refused_before_the_run(
         train(config, [recording], out=tmp_path / "run", test=recording)
     with pytest.raises(ValueError, match="sequence 00 has no poses"):
         train(config, [dataclasses.replace(recording, positions=None)], out=tmp_path / "run")
+    shared = {"sampling": dataclasses.replace(config.sampling, negatives=0), "chunk": 0, "tuples": 4}
+    with pytest.raises(ValueError, match="the triplet loss has no negatives"):
+        dataclasses.replace(config, **shared)
+    room = dataclasses.replace(recording, positions=np.asarray(recording.positions) * 0.01)
+    with pytest.raises(ValueError, match="expected places farther apart than"):
+        train(dataclasses.replace(config, **shared, share_negatives=True), [room], out=tmp_path / "run")
     taught = dataclasses.replace(config, loss=dataclasses.replace(config.loss, teacher="sglpr"))
     with pytest.raises(ValueError, match=r"loss\.teacher sglpr: expected the grid of .*, found Grid"):
         train(taught, [recording], out=tmp_path / "run")

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from sglpr_jax.data.cloud_map import BEHIND_M, NEAREST_M, TILE_M, on_trail, remove_hidden_points, tiled_cloud
+from sglpr_jax.data.fingerprint import fingerprint
 from sglpr_jax.data.readers import cloud_map, open_recording
 from sglpr_jax.data.readers.cloud_map import REACH_M
 from sglpr_jax.files import DataWarning
@@ -119,6 +120,15 @@ def write_tum(path, positions, quaternion=(0, 0, 0, 1)):
 
 def along(count=5, height_m=HEIGHT_M, start=ORIGIN):
     return start + np.stack([np.arange(count) * 5.0, np.zeros(count), np.full(count, height_m)], axis=1)
+
+
+def test_other_rotations_are_another_recording(tmp_path):
+    town, way = write_map(tmp_path / "town.pcd", street()), tmp_path / "way.tum"
+    found = {
+        fingerprint(open_recording(town, poses=write_tum(way, along(), turn), sensor_height=1.5), contents="all")
+        for turn in ((0, 0, 0, 1), (0, 0, 1, 0))
+    }
+    assert len(found) == 2
 
 
 @pytest.fixture

@@ -143,3 +143,6 @@ def test_invalid_arguments_are_one_clear_error():
     for wrong in ({"pose_times": times[::-1]}, {"pose_times": times[:1], "world_from_lidar": poses[:1]}):
         with pytest.raises(ValueError, match="deskew: expected two poses or more at increasing times, found"):
             sglpr_jax.deskew(clouds[0], WITHIN, **{**options, **wrong})
+    for within in (1e9 + WITHIN, 1e9 * WITHIN, np.nan * WITHIN):
+        with pytest.raises(ValueError, match="deskew: expected for each point its time relative to the scan"):
+            sglpr_jax.deskew(clouds[0], within, **options)

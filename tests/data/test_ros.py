@@ -183,6 +183,17 @@ def opened(tmp_path, kind, messages, **options):
     return open_recording(drive(tmp_path, kind, messages), sensor_height=1.7, **options)
 
 
+def test_a_scan_that_comes_late_is_read_at_its_time(tmp_path):
+    times = np.arange(5.0, 25.0, 0.1)
+    came = LATE_S + times + 0.15 * (np.arange(200) == 50)
+    messages = [("/points", CLOUD, came[i], cloud("mcap", times[i], points_of(i)[:4])) for i in range(200)]
+    track = [("/odom", ODOMETRY, LATE_S + t + 0.5, pose("mcap", t, where(t), turned(t))) for t in times]
+    recording = opened(tmp_path, "mcap", messages + track)
+    np.testing.assert_allclose(recording.times, times)
+    np.testing.assert_allclose(recording.positions, [where(t) for t in times], atol=1e-4)
+    np.testing.assert_array_equal(recording.points(50), points_of(50)[:4])
+
+
 UNCONNECTED = "interpolated; used as poses of lidar, since tf does not connect the two frames"
 
 

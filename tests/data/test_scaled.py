@@ -39,9 +39,10 @@ def test_a_scaled_recording_keeps_positions_and_times():
 
 @pytest.mark.parametrize(("metres", "expected"), [(5.0, 4), (20.0, 1)])
 def test_the_scale_is_chosen_by_how_far_most_points_are(metres, expected):
-    """Single far points, empty scans, and heights do not count."""
+    """Single far points, rays without an echo, empty scans, and heights do not count."""
     near = np.random.default_rng(1).uniform(-metres, metres, (200, 3)).astype(np.float32)
     near[:10], near[:, 2], near[10] = 80.0, 30.0, np.nan
+    near = np.concatenate([near, np.zeros((2000, 3), np.float32)])
     clouds = {Path(f"{i}.bin"): near for i in range(5)} | {Path("5.bin"): near[:0]}
     assert chosen_scale(of_scans(clouds)) == expected
     assert chosen_scale(of_images({Path("0.png"): np.zeros((4, 4), np.float32)})) == 1

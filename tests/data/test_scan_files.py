@@ -245,6 +245,13 @@ def test_a_map_is_read_in_parts(tmp_path, monkeypatch, suffix):
     np.testing.assert_allclose(np.concatenate(blocks), points, atol=6e-4)
 
 
+@pytest.mark.parametrize("data", ["binary", "binary_compressed", "ascii"])
+def test_a_map_keeps_the_digits_of_large_coordinates(tmp_path, data):
+    points = WHOLE + np.array([500_000.3, 5_735_712.3, 40.0])
+    path = write(tmp_path, "map.pcd", pcd(records_of(points, "x:f8 y:f8 z:f8"), data))
+    np.testing.assert_allclose(np.concatenate(list(cloud_blocks(path))), points, rtol=0, atol=1e-3)
+
+
 FAR = bytes(i % 251 for i in range(300))
 
 

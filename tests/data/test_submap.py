@@ -52,6 +52,13 @@ def test_points_lie_where_they_are_in_the_world_whatever_the_poses(steps, length
     assert len(found) >= 0.8 * len(seen_from(poses[-1]))
 
 
+def test_rays_without_an_echo_are_no_points_of_a_submap():
+    builder = SubmapBuilder()
+    builder.add(np.array([[0, 0, 0], [10, 0.1, 1]], np.float32), pose(0.0))
+    found = builder.add(np.array([[0, 0, 0], [10, 2, 1]], np.float32), pose(1.5))
+    np.testing.assert_allclose(found, [[10, 2, 1], [8.5, 0.1, 1]], atol=1e-6)
+
+
 @pytest.mark.parametrize("length_m", [5.0, 0.5])
 @pytest.mark.parametrize("steps", [range(40), [*range(18), 16, 17, 18, 17, *range(18, 36)]], ids=["on", "to and fro"])
 def test_a_builder_and_a_recording_give_the_same_submaps_in_any_order(steps, length_m):

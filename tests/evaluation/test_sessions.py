@@ -50,6 +50,12 @@ def test_columns_are_the_scores_of_the_sessions_and_their_mean(session, evaluate
     ]
 
 
+def test_sessions_of_one_name_are_named_by_their_files(session, evaluate):
+    other = dataclasses.replace(session(NCLT[0]), sequence=MAP)
+    (name,) = evaluate(session(MAP), [other]).methods
+    assert name.endswith("1") and name != MAP
+
+
 def test_a_session_without_revisits_is_not_in_the_mean(session, evaluate):
     near, beside = session(NCLT[0]), session(NCLT[1])
     beside = dataclasses.replace(beside, positions=np.add(beside.positions, [0, 12, 0]))

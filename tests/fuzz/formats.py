@@ -22,7 +22,7 @@ from sglpr_jax.data.readers.mulran_helipr_boreas_nclt import read_nclt_poses
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.evaluation.inputs import read_input
-from sglpr_jax.files import read_json
+from sglpr_jax.files import read_json, write_text
 from sglpr_jax.frame_log import HEAD, FrameLog
 from sglpr_jax.grid import Grid
 from sglpr_jax.loops.closure import LoopClosure
@@ -257,7 +257,9 @@ FORMATS = {
         loop_files.read_g2o,
     ),
     "loops .jsonl": Format(
-        "a.jsonl", written(lambda path: loop_files.write_loops_jsonl(path, LOOPS), "a"), loop_files.read_loops_jsonl
+        "a.jsonl",
+        written(lambda path: write_text(path, loop_files.loop_lines(LOOPS)), "a"),
+        loop_files.read_loops_jsonl,
     ),
     "configuration": Format(CONFIG_FILE, CONFIG_JSON, lambda path: config_from_dict(read_json(path), source=path)),
     "weights": Format(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.scan import Scan
-from sglpr_jax.files import in_short
+from sglpr_jax.files import WriteError, in_short
 from sglpr_jax.live.data_types import AGAIN_S, FrameStatus, LiveFrame, LoopEdge, Reports
 from sglpr_jax.live.live_map import LiveMap
 from sglpr_jax.live.node import Node
@@ -115,6 +115,8 @@ def test_a_closed_terminal_does_not_end_the_node():
 
 
 def test_results_are_lines_of_json(tmp_path, said, monkeypatch):
+    with pytest.raises(WriteError, match="cannot be written"):
+        open_sink(f"json:{tmp_path}", LiveOptions(), said)
     sink = open_sink(f"json:{tmp_path}/lines", LiveOptions(), said)
     sink.frame(FrameStatus(3, 1e9 + 0.123456789, 0.0123456789, 0.02, 1, 4, 100))
     sink.loop(EDGE)

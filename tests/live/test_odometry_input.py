@@ -32,6 +32,11 @@ def test_a_clock_that_jumps_is_followed(said, other):
     assert clock.time(1e9 + 0.6, 50.6) == pytest.approx(start + 0.6) and said.kinds[-1] == "clock"
 
 
+def test_a_pause_of_a_recording_is_no_change_of_the_clock(said):
+    clock = ScanClock(said)
+    assert [clock.time(stamp, 50.0, is_recorded=True) for stamp in (1e9, 1e9 + 90)] == [1e9, 1e9 + 90] and not said
+
+
 @pytest.mark.parametrize("wrong_s", [-3600.0, -1.0, 3600.0])
 def test_a_single_wrong_time_does_not_change_the_clock(said, wrong_s):
     clock = ScanClock(said)
@@ -64,6 +69,18 @@ def test_odometry_that_jumps_or_is_reset_begins_anew(said):
     found = placed(OdometryContinuity(said, expected=True), drive)
     assert found == [True, True, False, True, True, False, False]
     assert said.kinds == ["jump"] * 3
+
+
+def test_a_reset_is_noticed_if_the_lidar_is_beside_the_origin(said):
+    begin = transform(0.3, 0.5, 0.0)
+    drive = [(0.1 * i, at(0.1 * i) @ begin) for i in range(51)]
+    found = placed(OdometryContinuity(said, expected=True), [*drive, (5.1, begin)])
+    assert found == [True] * 51 + [False] and said.kinds == ["jump"]
+
+
+def test_odometry_that_passes_its_begin_at_speed_continues(said):
+    drive = [(0.1 * i, at(1.5 * (i - 9))) for i in range(20)]
+    assert all(placed(OdometryContinuity(said, expected=True), drive)) and not said
 
 
 def test_odometry_that_is_missing_is_told_and_a_scan_may_be_left_out_for_a_while(said):

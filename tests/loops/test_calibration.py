@@ -8,12 +8,14 @@ from hypothesis import strategies as st
 from sglpr_jax.data.scan_stream import only
 from sglpr_jax.loops.calibration import (
     EDGES,
+    _Drive,
     calibrated,
     calibration_error,
     certain_pairs,
     reliability,
     reliability_of,
 )
+from sglpr_jax.loops.candidates import CandidateSearch
 from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.probability import AdditiveModel, Curve, Evidence, LoopModel, default_model
 
@@ -29,6 +31,13 @@ def test_certain_pairs_are_told_apart_and_a_model_fits_them(street, params):
     assert np.median(evidence.along_m[is_loop]) < np.median(evidence.along_m[~is_loop])
     probability = model.probability(evidence)
     assert probability[is_loop].mean() > 0.8 and probability[~is_loop].mean() < 0.2
+
+
+def test_images_are_compared_without_the_background_as_in_a_search(street, params):
+    few = only(street, range(2))
+    stored, finder = _Drive(params, few, street.poses.world_from_lidar[:2]).stored, CandidateSearch(params)
+    finder.add_keyframe(finder.keyframe(few.scan(0, labels=False)))
+    np.testing.assert_array_equal(stored.image(0), finder.stored.image(0))
 
 
 def test_odometry_of_another_length_or_of_a_vehicle_that_stands_still_is_refused(street, params):

@@ -7,6 +7,7 @@ import pytest
 from scenes import place, seen_from
 
 import sglpr_jax
+from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.grid import Grid
 from sglpr_jax.loops.candidates import CandidateSearch
@@ -205,6 +206,18 @@ def test_a_sensor_that_stands_at_the_start_is_seen_to_move_off(params):
 
 
 @pytest.mark.slow
+def test_flat_odometry_measures_no_height_whatever_the_mountings(params):
+    finder = finder_of(params)
+    for frame, height_m in enumerate((1.2, 1.25, 1.22)):
+        keyframe = seen_by(finder, posts_from(2.0 * frame))._replace(mounting=Mounting(height_m))
+        finder.add_keyframe(keyframe, odometry=transform(2.0 * frame, 0.0, 0.0), fits=NO_FITS)
+    assert not finder.knows_height
+    raised = transform(6.0, 0.0, 0.0)
+    raised[2, 3] = 0.1
+    finder.add_keyframe(keyframe, odometry=raised, fits=NO_FITS)
+    assert finder.knows_height
+
+
 def test_a_scan_that_cannot_be_read_costs_the_motion_of_its_own_frame_only(params):
     finder = finder_of(params)
     for x in range(12):

@@ -154,6 +154,8 @@ def test_what_is_missing_explains_why_there_are_no_loops():
     found = dataclasses.replace(found_in(700), rejected=rejected)
     assert diagnose_no_loops(found) == [f"3 pairs were rejected. For 2 of them: {MEANING['repeats']}"]
     assert diagnose_no_loops(dataclasses.replace(found, loops=(LOOP,))) == []
+    twice = LoopSearchResult(found_in(700).sessions * 2)
+    assert [line.split(":")[0] for line in diagnose_no_loops(twice)] == ["08", "08~2"]
 
 
 def test_degenerate_loops_are_counted_and_can_be_rejected():

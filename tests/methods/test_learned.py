@@ -12,6 +12,7 @@ from sglpr_jax.data.density_image import density_bev
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.scan import Scan
 from sglpr_jax.labels import to_raw
+from sglpr_jax.methods import registry
 from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.learned.bevplace import grey_image
 from sglpr_jax.methods.learned.method import Tuples
@@ -127,6 +128,18 @@ def test_a_scan_without_a_place_is_named(name):
     if name in words:
         with pytest.raises(ValueError, match=words[name]):
             method.prepare(scan([[5, 0, -1.7], [6, 0, -1.6]], [9, 9]))
+
+
+@pytest.mark.parametrize(
+    ("name", "blank"),
+    [
+        ("disco", scan(np.full((50, 3), 0.3))),
+        ("bevplace++", Scan(image=np.zeros((151, 151), np.float32), name="scan 7")),
+    ],
+)
+def test_a_scan_of_a_blocked_sensor_is_named(name, blank):
+    with pytest.raises(ValueError, match="scan 7: expected points or pixels"):
+        registry._learned_input(LEARNED[name], blank, None)
 
 
 @pytest.mark.parametrize("name", NETWORKS)

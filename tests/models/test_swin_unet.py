@@ -1,5 +1,7 @@
 """What the Swin-Unet promises beyond its numbers: purity, stochastic depth, transformations, clear errors."""
 
+import dataclasses
+
 import flax.linen as nn
 import flax.traverse_util
 import jax
@@ -9,8 +11,9 @@ import pytest
 
 from sglpr_jax import losses
 from sglpr_jax.models.backbone_config import CircularConfig, SglprConfig, SwinConfig
-from sglpr_jax.models.config import HeadConfig, ModelConfig
+from sglpr_jax.models.config import HeadConfig, ModelConfig, model_preset
 from sglpr_jax.models.layers import LayerNorm
+from sglpr_jax.models.sglpr import init
 from sglpr_jax.models.swin import PatchExpand, SwinBlock, WindowAttention
 from sglpr_jax.models.swin_unet import CircularSwin, SwinUnet
 from sglpr_jax.models.torch_import import from_torch_names, torch_name
@@ -176,3 +179,6 @@ def test_what_does_not_fit_is_an_error():
         SglprConfig(depths=(2,))
     with pytest.raises(ValueError, match="3 x 3 kernels"):
         HeadConfig(channels=(8,), kernels=(4,), strides=(1,), means=(1,))
+    config = dataclasses.replace(model_preset("sglpr-small"), polar=(64, 360))
+    with pytest.raises(ValueError, match=r"means: expected a polar map that 1 x 2 pixels tile, found \d+ x 45 pixels"):
+        jax.eval_shape(lambda: init(jax.random.key(0), config=config))

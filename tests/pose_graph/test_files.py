@@ -8,16 +8,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.formats.pose_files import read_kitti, read_trajectory, read_tum
-from sglpr_jax.files import DataWarning
+from sglpr_jax.files import DataWarning, write_text
 from sglpr_jax.loops.closure import LoopClosure
 from sglpr_jax.odometry.drift_model import DriftModel
 from sglpr_jax.pose_graph.files import (
+    loop_lines,
     read_g2o,
     read_loops_jsonl,
     write_g2o,
     write_kitti,
     write_loops_csv,
-    write_loops_jsonl,
     write_tum,
 )
 from sglpr_jax.se3 import inverse
@@ -83,7 +83,7 @@ def test_edges_without_information_have_the_unit_matrix(tmp_path):
 
 
 def test_loops_come_back_from_json_lines_and_csv(tmp_path, loops):
-    write_loops_jsonl(tmp_path / "loops.jsonl", loops, ids=[f"frame{i}" for i in range(6)])
+    write_text(tmp_path / "loops.jsonl", loop_lines(loops, ids=[f"frame{i}" for i in range(6)]))
     write_loops_csv(tmp_path / "loops.csv", loops)
     first = json.loads((tmp_path / "loops.jsonl").read_text().splitlines()[0])
     assert (first["query_id"], first["match_id"]) == ("frame5", "frame0")
@@ -134,7 +134,7 @@ def test_wrong_files_are_one_clear_error(tmp_path, read, text, message):
 )
 def test_a_loop_with_an_impossible_covariance_is_refused(tmp_path, loops, covariance):
     path = tmp_path / "loops.jsonl"
-    write_loops_jsonl(path, [loops[0], dataclasses.replace(loops[1], covariance=covariance)])
+    write_text(path, loop_lines([loops[0], dataclasses.replace(loops[1], covariance=covariance)]))
     with pytest.raises(ValueError, match=r"loops\.jsonl, line 2: expected a loop as JSON"):
         read_loops_jsonl(path)
     assert len(read_loops_jsonl(path, skip_damaged=True)) == 1

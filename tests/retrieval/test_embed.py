@@ -15,7 +15,9 @@ from sglpr_jax.grid import Grid
 from sglpr_jax.labels import to_classes
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.method import HandcraftedMethod, Method
-from sglpr_jax.methods.registry import checked_view, handcrafted, rotated_scan
+from sglpr_jax.methods.registry import checked_view, handcrafted, method_beside, rotated_scan
+from sglpr_jax.models.config import model_preset
+from sglpr_jax.models.weights import Params
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import embed
 
@@ -208,6 +210,11 @@ def test_points_are_described_scan_by_scan(scans):
 
 def mean_of(scan):
     return scan.upright_points.mean(axis=0)
+
+
+def test_an_untrained_network_does_not_have_the_hash_of_a_teacher():
+    taught = Params({}, dataclasses.replace(model_preset("tiny"), descriptors_of="a teacher"))
+    assert method_beside(taught, "untrained", ready_made=False, seed=0).weights_hash != "a teacher"
 
 
 def learned(prepare=mean_of, describe=lambda inputs: inputs, takes="points") -> Method:

@@ -1,7 +1,9 @@
 """Small scenes for tests of rays and sensor, and a numpy reference that tries every surface of every shape."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from sglpr_jax.se3 import poses_of
 from sglpr_jax.sim.ground import Ground, Relief
 from sglpr_jax.sim.shapes import Scene, Shapes
 
@@ -50,17 +52,8 @@ def random_scene(seed: int, count: int = 12) -> Scene:
 
 def pose(x: float = 0, y: float = 0, z: float = 0, *, yaw: float = 0, pitch: float = 0, roll: float = 0) -> np.ndarray:
     """world_from_lidar that turns about z after y after x."""
-    (cz, cy, cx), (sz, sy, sx) = np.cos((yaw, pitch, roll)), np.sin((yaw, pitch, roll))
-    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = about_z @ about_y @ about_x, (x, y, z)
-    return matrix
-
-
-def in_world(points: np.ndarray, world_from_lidar: np.ndarray) -> np.ndarray:
-    return points[:, :3] @ world_from_lidar[:3, :3].T + world_from_lidar[:3, 3]
+    rotation = Rotation.from_euler("ZYX", (yaw, pitch, roll)).as_matrix()
+    return poses_of(np.array([[x, y, z]], float), rotation[None])[0]
 
 
 def striped_ground(relief: Relief, low: int, high: int) -> Ground:

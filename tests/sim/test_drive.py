@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 
+from sglpr_jax.files import DataWarning
 from sglpr_jax.sim.drive import CARRIERS, PlanarPath, plan_path, poses_on, read_path, scan_rows
 from sglpr_jax.sim.ground import draw_relief, relief_height
 from sglpr_jax.sim.recording import simulate_repeating
@@ -109,13 +110,28 @@ def test_a_pose_file_becomes_a_trajectory(tmp_path):
     np.testing.assert_allclose(path.times, np.arange(60) / 10)
     np.savetxt(tmp_path / "times.txt", planned.times + 5)
     np.testing.assert_allclose(read_path(tmp_path / "campus.txt").times, planned.times)
+    np.savetxt(tmp_path / "times.txt", np.arange(60))
+    with pytest.warns(DataWarning, match="found row numbers"):
+        np.testing.assert_allclose(read_path(tmp_path / "campus.txt").times, np.arange(60) / 10)
+
+
+def test_a_pose_file_with_z_up_is_told(tmp_path):
+    rows = np.tile(np.eye(3, 4), (200, 1, 1))
+    rows[:, :2, 3] = np.linspace(0, 300, 200)[:, None]
+    np.savetxt(tmp_path / "campus.txt", rows.reshape(200, 12))
+    with pytest.warns(DataWarning, match=r"campus.txt: expected z up, found heights over 300 m"):
+        read_path(tmp_path / "campus.txt")
 
 
 @pytest.mark.parametrize(
     ("content", "times", "said"),
     [
         ("", None, "campus.txt: expected 2 poses or more, 12 numbers a line, found 0"),
-        ("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3, "0\n1\n", "times.txt: expected 3 times, one per pose of campus.txt, found 2"),
+        (
+            "1 0 0 0 0 1 0 0 0 0 1 0\n" * 3,
+            "0\n0.5\n",
+            "times.txt: expected 3 times, one per pose of campus.txt, found 2",
+        ),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3, "0\n1\n1\n", "times.txt, line 3: expected a time > 1.0, found 1.0"),
     ],
 )

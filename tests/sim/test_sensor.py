@@ -5,8 +5,9 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from surfaces import FLAT, NOTHING, in_world, pose, shapes, striped_ground
+from surfaces import FLAT, NOTHING, pose, shapes, striped_ground
 
+from sglpr_jax.se3 import transformed
 from sglpr_jax.sim.ground import Relief
 from sglpr_jax.sim.labels import BUILDING, POLE, ROAD, TERRAIN, VEGETATION
 from sglpr_jax.sim.sensor import SENSORS, Sensor, scan, scattered
@@ -38,7 +39,7 @@ def walled_world(*poles: tuple[float, ...], relief: Relief = FLAT, glass: float 
 @pytest.mark.parametrize("where", [pose(z=1.73), *TILTED])
 def test_wall_and_ground_coincide_in_the_world_from_every_pose(where):
     points, labels = scan(KEY, walled_world(), where, sensor=EXACT)
-    world = in_world(points, where)
+    world = transformed(where, points[:, :3])
     wall, ground = labels == BUILDING, labels != BUILDING
     assert wall.sum() > 30 and ground.sum() > 100
     np.testing.assert_allclose(world[wall, 0], 10, atol=1e-3)

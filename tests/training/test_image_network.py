@@ -15,7 +15,7 @@ from sglpr_jax.labels import UNLABELLED
 from sglpr_jax.models.sglpr import describe, forward, init
 from sglpr_jax.models.weights import by_name, for_places
 from sglpr_jax.models.weights_file import save
-from sglpr_jax.training.batches import in_batch_order, in_network_order, mix
+from sglpr_jax.training.batches import Batch, in_batch_order, in_network_order
 from sglpr_jax.training.config import LossConfig, OcclusionConfig, OptimizerConfig, without_untrained_head
 from sglpr_jax.training.image_network import (
     ImageNetwork,
@@ -281,29 +281,16 @@ def test_hidden_cells_have_neither_counts_nor_labels(config, make_batch):
     assert (labels != UNLABELLED).any()
 
 
-def half(batch, rows: slice, tuples: slice):
-    """Some tuples of a batch, alone."""
-    cut = {
-        name: None if value is None else value[rows]
-        for name, value in ((n, getattr(batch, n)) for n in ("labelled", "images", "points", "count", "classes"))
-    }
-    return batch.replace(negatives=batch.negatives[tuples, rows], **cut)
-
-
-@pytest.fixture
-def mixed(make_batch):
-    """A tuple of images and one of scans, of which one has no labels; the scans count for the segmentation alone."""
-    images = half(make_batch(0, images=True), slice(0, 4), slice(0, 1))
-    scans = half(make_batch(1), slice(4, 8), slice(1, 2))
-    return mix(images, scans, triplets=False, share_negatives=False)
+MIXED = Batch(np.arange(8) >= 4, None, 1, images=np.zeros((4, 1, 1)), second=True)
+"""Four places without labels, and four of a second batch."""
 
 
 @pytest.mark.parametrize("every", [1, 2, 4])
-def test_labelled_places_are_moved_to_segmented_positions_and_back(mixed, every):
+def test_labelled_places_are_moved_to_segmented_positions_and_back(every):
     places = jnp.arange(8)
-    order = in_network_order(places, mixed, every=every)
-    np.testing.assert_array_equal(in_batch_order(order, mixed, every=every), places)
+    order = in_network_order(places, MIXED, every=every)
+    np.testing.assert_array_equal(in_batch_order(order, MIXED, every=every), places)
     seen = np.asarray(order)[::every]
     assert (seen >= 4).sum() == min(len(seen), 4)
-    alone = mixed.replace(second=None)
+    alone = MIXED.replace(second=None)
     np.testing.assert_array_equal(in_network_order(places, alone, every=every), places)

@@ -157,6 +157,10 @@ def test_recordings_that_do_not_fit_are_errors(tmp_path):
     straight = dataclasses.replace(loop("c", 2), positions=np.arange(60.0)[:, None] * [10, 0, 0])
     with pytest.raises(ValueError, match="sequence c: expected revisits within 5 m"):
         require_revisits([straight])
+    sparse = prepare_inputs(TINY, [straight], tmp_path / "cache")
+    with pytest.raises(ValueError, match="expected frames within"):
+        train_learned(TINY, sparse, settings(), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_step_is_that_of_adam_with_weight_decay():

@@ -73,21 +73,19 @@ def table_scan(path: Path, *, parse: Parser) -> Scan:
     check_points(table.points, bytes_each=table.row_bytes)
     names = [field.name for field in table.fields if field.count == 1]
     wanted = [*AXES, *(name for name in (*TIME_FIELDS, *LASER_FIELDS) if names.count(name) == 1)]
-    decoders = {"binary": _binary_records, "binary_compressed": _compressed_columns, "ascii": _text_columns}
-    return cloud_scan(decoders[table.encoding](table, wanted))
+    return cloud_scan(DECODERS[table.encoding](table, wanted))
 
 
 def table_blocks(path: Path, *, parse: Parser) -> Iterator[Float64[np.ndarray, "_ 3"]]:
-    """Yield the points of a map in metres, in blocks of `BLOCK_POINTS`, or all at once if the file is not binary."""
+    """Yield the points of a map in metres, in blocks of `BLOCK_POINTS`. Only binary files are decoded in blocks."""
     with path.open("rb") as stream:  # mapped: a binary file may be larger than the memory
         table = parse(memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)))
     if table.encoding != "binary":
-        yield table_scan(path, parse=parse).cloud.astype(np.float64)
-        return
-    records = _binary_records(table, AXES)
-    for start in range(0, len(records), clouds.BLOCK_POINTS):
-        block = records[start : start + clouds.BLOCK_POINTS]
-        yield np.stack([block[axis].astype(np.float64) for axis in AXES], axis=1)
+        check_points(table.points, bytes_each=table.row_bytes)
+    columns = DECODERS[table.encoding](table, AXES)
+    for start in range(0, table.points, clouds.BLOCK_POINTS):
+        rows = slice(start, start + clouds.BLOCK_POINTS)
+        yield np.stack([columns[axis][rows].astype(np.float64) for axis in AXES], axis=1)
 
 
 def _binary_records(table: PointTable, names: Sequence[str]) -> np.ndarray:
@@ -146,6 +144,10 @@ def _text_columns(table: PointTable, names: Sequence[str]) -> dict[str, np.ndarr
         raise ValueError(f"{expected}, found lines of {rows.shape[1]}")
     column_names = [field.name for field in fields_by_width[width] for _ in range(field.count)]
     return {name: rows[:, column_names.index(name)] for name in names}
+
+
+DECODERS = {"binary": _binary_records, "binary_compressed": _compressed_columns, "ascii": _text_columns}
+"""Functions that return columns of a table, by its encoding."""
 
 
 def _nonblank_lines(body: Content) -> list[bytes]:

@@ -7,6 +7,7 @@ The recording has a scan for each pose. A scan is computed from the map on acces
 pose within `REACH_M`. Poses without points around them are left out.
 """
 
+import hashlib
 from functools import partial
 from pathlib import Path
 
@@ -55,6 +56,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     world_from_lidar = _raise_poses_on_ground(cloud, trajectory.poses, np.flatnonzero(has_points), poses)
     ids = tuple(f"{row:06d}" for row in range(len(has_points)))
     used = f"{cloud.total} points, {len(cloud.points)} of them used (near the trajectory, one per voxel, not moving)"
+    poses_hash = hashlib.sha256(world_from_lidar.tobytes()).hexdigest()
     recording = Recording(
         name=root.stem,
         ids=ids,
@@ -62,7 +64,7 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
         times=trajectory.times,
         pose_source=trajectory.source,
         paths=tuple(map(Path, ids)),
-        read=partial(_read, cloud=cloud, world_from_lidar=world_from_lidar),
+        read=partial(_read, cloud=cloud, world_from_lidar=world_from_lidar, poses_hash=poses_hash),
         on_disk=False,
         world_from_lidar=world_from_lidar,
         containers=(root,),
@@ -71,8 +73,11 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     return recording if has_points.all() else only(recording, np.flatnonzero(has_points).tolist())
 
 
-def _read(path: Path, labels: Path | None, *, cloud: TiledCloud, world_from_lidar: Float[np.ndarray, "n 4 4"]) -> Scan:
-    """Compute the scan of a pose for a `Recording`. `path` is its id, which is the row of the pose."""
+def _read(
+    path: Path, labels: Path | None, *, cloud: TiledCloud, world_from_lidar: Float[np.ndarray, "n 4 4"], poses_hash: str
+) -> Scan:
+    """Compute the scan of a pose for a `Recording`. `path` is its id, which is the row of the pose. `poses_hash` is
+    for caches only, which compare the arguments of this function."""
     points = _points_at(cloud, world_from_lidar[int(path.name)])
     return Scan(points=remove_hidden_points(points, spacing_m=cloud.spacing_m, reach_m=REACH_M))
 

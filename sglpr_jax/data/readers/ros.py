@@ -12,6 +12,7 @@ from sglpr_jax.data.formats.pose_files import warn_of_jumps
 from sglpr_jax.data.formats.ros_bag import CLOUDS, COMPRESSED, METADATA, RosBag
 from sglpr_jax.data.formats.ros_messages import (
     IMU,
+    MOST_LATE,
     POSES,
     TRANSFORMS,
     Stamps,
@@ -48,17 +49,20 @@ def open_recording(root: Path, name: str, options: ReadOptions) -> Recording:
     """
     bag, topic = _recordings(root)[name]
     stamps = bag.read(topic, lambda messages: Stamps.of((time, message.header().time) for time, message in messages))
-    recorder_ns = stamps.recorder_ns
-    if not len(recorder_ns):
+    if not len(stamps.recorder_ns):
         raise ValueError(f"{root}: expected point clouds on {topic}, found no message")
+    # Several messages may have the same recorder time, so a scan is found by that time and its row among them.
+    nth = np.arange(len(stamps.recorder_ns)) - np.searchsorted(stamps.recorder_ns, stamps.recorder_ns)
+    if stamps.headers_are_valid(most_late=MOST_LATE):  # scans that came late are sorted by their headers
+        order = np.argsort(stamps.header_s, kind="stable")
+        stamps, nth = Stamps(stamps.recorder_ns[order], stamps.header_s[order]), nth[order]
+    recorder_ns = stamps.recorder_ns
     times: np.ndarray | None = stamps.seconds
     if problem := time_unit_problem(times, numbers=False):
         expected = "times in seconds in the headers or of the recorder"
         warn(f"{root}, {topic}: expected {expected}, found {problem}; not used")
         times = None
     ids = tuple(f"{i:06d}" for i in range(len(recorder_ns)))
-    # Several messages may have the same recorder time, so a scan is found by that time and its row among them.
-    nth = np.arange(len(recorder_ns)) - np.searchsorted(recorder_ns, recorder_ns)
     time_and_nth = dict(zip(ids, zip(recorder_ns.tolist(), nth.tolist(), strict=True), strict=True))
     first_ns = int(recorder_ns[0])
     recording = Recording(
