@@ -107,7 +107,7 @@ def simulate(
       aside_m: Distance of the drive to the left of its usual line through the same town, in metres.
       submap_m: Travelled distance of submaps, in metres. 0 writes scans.
       images: Whether to write density images with label images instead of scans.
-      vary: Whether the images show scans that are rotated about z, some of them with lost points. See `layouts.vary`.
+      vary: Whether the images show scans that are rotated about z, most of them with lost points. See `layouts.vary`.
       on_start: Called with the dataset's description after all arguments are checked.
       on_progress: Called with the number of completed scans, counting `scans` for each recording.
 

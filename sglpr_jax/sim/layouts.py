@@ -159,7 +159,7 @@ label images, without times. "nclt" is the layout of NCLT's sessions, without la
 def vary(
     points: Float32[np.ndarray, "n 3"], labels: Int[np.ndarray, " n"], mounting: Mounting | None
 ) -> tuple[Float32[np.ndarray, "m 3"], Int[np.ndarray, " m"]]:
-    """Removes random points or whole rings of some scans, levels the scan, and rotates it about z by a random angle.
+    """Removes random points or whole rings of most scans, levels the scan, and rotates it about z by a random angle.
 
     The random seed is a hash of `points`, which are in the LiDAR frame.
     """
