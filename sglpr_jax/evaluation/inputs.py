@@ -64,7 +64,7 @@ def read_input(
         return read_descriptor_file(path, trajectory, fallback)
     if ":" in next((line for _, line in _read_lines(path)), ""):
         return _read_top_k_list(path, trajectory, sequence=sequence)
-    return _read_pair_list(path, trajectory)
+    return _read_pair_list(path, trajectory, sequence=sequence)
 
 
 def read_methods(
@@ -255,7 +255,7 @@ def _read_top_k_list(path: Path, trajectory: Trajectory | None, *, sequence: str
         )
 
 
-def _read_pair_list(path: Path, trajectory: Trajectory | None) -> ScoredPairs:
+def _read_pair_list(path: Path, trajectory: Trajectory | None, *, sequence: str) -> ScoredPairs:
     """Read lines `i j score [label]`, with a label in every line or in none. Without labels, positions are required."""
     rows = [(line_name, line.split()) for line_name, line in _read_lines(path)]
     if not rows:
@@ -274,8 +274,8 @@ def _read_pair_list(path: Path, trajectory: Trajectory | None) -> ScoredPairs:
     pairs = np.array([[_parse_frame(word, line_name, trajectory) for word in words[:2]] for line_name, words in rows])
     scores = np.array([_parse_score(words[2], line_name) for line_name, words in rows])
     if trajectory is None:
-        return ScoredPairs(pairs, scores, labels)
-    return ScoredPairs(pairs, scores, labels, trajectory.positions, trajectory.source)
+        return ScoredPairs(pairs, scores, labels, sequence=sequence)
+    return ScoredPairs(pairs, scores, labels, trajectory.positions, trajectory.source, sequence)
 
 
 def _read_lines(path: Path) -> Iterator[tuple[str, str]]:

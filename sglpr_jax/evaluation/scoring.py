@@ -230,15 +230,16 @@ def evaluate_methods(
     """
     first = next(iter(methods.values()))
     protocol_names = chosen_protocols(kind_of(first), protocols)
+    published_rows = paper.table_1_rows(first.sequence) if published else ()  # an error before the scoring
     results = {}
     for method, source in methods.items():
         with naming(method):
             check_agreement(first, source)
             results[method] = score(source, protocol_names)
     if isinstance(first, ScoredPairs):
-        sequence, title = "scored pairs", f"{'pairs' if file is None else file.name}, {len(first.pairs)} pairs"
+        title = f"{'pairs' if file is None else file.name}, {len(first.pairs)} pairs"
     else:
-        sequence, title = first.sequence, f"sequence {printable(first.sequence)}, {len(first)} scans"
+        title = f"sequence {printable(first.sequence)}, {len(first)} scans"
     made_with: dict[str, Any] = {} if file is None else {"file": str(file)}
     if isinstance(first, DescriptorFile):
         made_with |= {"config": first.config, "weights_hash": first.weights_hash, "distance": first.distance}
@@ -247,7 +248,7 @@ def evaluate_methods(
         about=_about(first) if file is None else f"{file}: {_about(first)}",
         methods=results,
         positions=first.positions,
-        published=paper.table_1_rows(sequence) if published else (),
+        published=published_rows,
         made_with=made_with,
     )
 

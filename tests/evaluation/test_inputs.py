@@ -143,6 +143,13 @@ def test_bad_input_raises_an_error_with_the_file_name(read, monkeypatch, name, c
         read(name, content)
 
 
+def test_pairs_have_the_published_numbers_of_their_sequence(read):
+    pairs = read("pairs.txt", "400 0 0.5 1\n100 0 0.1 0\n")
+    assert evaluate_methods({"mine": dataclasses.replace(pairs, sequence="08")}, published=True).published
+    with pytest.raises(ValueError, match=r"expected a sequence with published numbers, .*, found town"):
+        evaluate_methods({"mine": pairs}, published=True)
+
+
 def test_default_protocols_fit_the_input(read):
     inputs = read("a.npy", np.ones((800, 2))), read("p.txt", "5 0 .5\n"), read("b.txt", "5: 0\n")
     matrix, pairs, bare = map(kind_of, inputs)

@@ -33,7 +33,7 @@ from sglpr_jax.evaluation.protocols.top1 import (
 from .by_the_letter import pairs, random_drive, recall, recall_across, top1, within
 
 DESCRIPTORS = protocols_taking("descriptors")
-UNPUBLISHED = "5 m, no published split: database is the first 60% of the frames, queries begin 20 m from its end"
+UNPUBLISHED = "5 m, no published split: database is the first 60% of the path, queries begin 20 m from its end"
 
 
 @pytest.fixture(scope="module")
@@ -176,7 +176,13 @@ def test_frames_next_to_the_end_of_the_database_are_no_queries(make_file):
     assert (crawl.counts, np.isnan(crawl.score)) == ({"queries": 0, "revisits": 0}, True)
     again = np.vstack([up, back[:30], np.repeat(up[:1], 10, axis=0)])
     found = BEVPLACE_RECALL_AT_1(make_file(again, again))
-    assert (found.counts, found.score) == ({"queries": 40, "revisits": 10}, 1.0)
+    assert (found.counts, found.score) == ({"queries": 13, "revisits": 10}, 1.0)
+
+
+def test_a_stop_at_the_start_leaves_the_queries(make_file, two_laps):
+    parked = np.concatenate([np.repeat(two_laps[:1], 1600, axis=0), two_laps])
+    moving, stopped = (BEVPLACE_RECALL_AT_1(make_file(places, places)) for places in (two_laps, parked))
+    assert stopped.counts == moving.counts
 
 
 @pytest.fixture(scope="module")

@@ -105,6 +105,8 @@ class ScoredPairs:
     """Position of every frame in metres, z up. Required without labels."""
     pose_source: str | None = None
     """Source of the poses, in words."""
+    sequence: str = "scored pairs"
+    """Name of the sequence."""
 
     def __post_init__(self):
         p = len(self.pairs)

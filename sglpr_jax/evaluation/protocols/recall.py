@@ -23,6 +23,7 @@ from sglpr_jax.evaluation.protocols.protocol import (
 from sglpr_jax.evaluation.protocols.result import Decision, Result, percentile_interval, resampled_means
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile, check_same_method
 from sglpr_jax.revisits import Near, has_near
+from sglpr_jax.se3 import lengths_along
 
 SPLITS = {
     "00": (3000, 3200, 4541),
@@ -36,7 +37,7 @@ of the queries is the end of the sequence."""
 V1_SPLITS = {"00": SPLITS["00"], "02": SPLITS["02"], "05": (1000, 1200, 2751), "06": SPLITS["06"]}
 """Splits of BEVPlace: those of BEVPlace++ without 08, and with ten queries fewer in 05."""
 DATABASE_SHARE = 0.6
-"""Fraction of the frames that is the database, for recordings without a published split."""
+"""Fraction of the travelled distance that is the database, for recordings without a published split."""
 SEAM_M = 20.0
 """Distance between the last frame of the database and the first query in metres, without a published split. Published
 splits skip 200 frames (neighbours, not revisits), which are too many for a short recording."""
@@ -95,18 +96,19 @@ def _published_split(
     """Return a split like BEVPlace's: the first frames of a recording are the database, and later frames are queries.
 
     `splits` are used for recordings with the name and number of frames of a KITTI sequence. For other recordings the
-    database is the first 60 % of the frames, and the first query is the first frame 20 m from the end of the database.
+    database is the first 60 % of the travelled distance, and the first query is the first frame 20 m from its end.
     """
     n = len(source)
     if source.sequence in splits and SPLITS[source.sequence][2] == n:
         database_end, first_query, queries_end = splits[source.sequence]
         rule = f"{paper} split: database 0 to {database_end - 1}, queries {first_query} to {queries_end - 1}"
     else:
-        database_end, queries_end = max(int(DATABASE_SHARE * n), 1), n
+        length_m, queries_end = lengths_along(positions), n
+        database_end = max(int(np.searchsorted(length_m, DATABASE_SHARE * length_m[-1])), 1)
         metres = np.linalg.norm(positions[database_end:] - positions[database_end - 1], axis=1)
         is_far = metres >= SEAM_M
         first_query = database_end + int(is_far.argmax()) if is_far.any() else n
-        database = f"database is the first {DATABASE_SHARE:.0%} of the frames"
+        database = f"database is the first {DATABASE_SHARE:.0%} of the path"
         rule = f"no published split: {database}, queries begin {SEAM_M:g} m from its end"
     return np.arange(first_query, queries_end), np.full(queries_end - first_query, database_end), rule
 
