@@ -174,7 +174,7 @@ def open_recordings(command: TrainCommand) -> "tuple[Sequence[Recording], Sequen
     options = {name: getattr(command, name) for name in ("pose_source", "format", "sensor_height")}
     recordings, test = leave_one_out(roots, command.seq, train_seqs=command.train_seq, **options)
     also = [recording for folder in command.also for recording in all_recordings(folder, **options)]
-    if fingerprint(test) in map(fingerprint, also):
+    if also and fingerprint(test) in map(fingerprint, also):
         raise ValueError(f"--also: expected datasets without the tested recording {command.seq}, found it in one")
     if command.skip_bad:
         *readable, test = without_bad_scans([*recordings, *also, test], on_bad_scan=report_bad_scan)

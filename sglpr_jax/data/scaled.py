@@ -12,7 +12,7 @@ from jaxtyping import Float
 from sglpr_jax.data.choices import SCALE, Scale
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.scan import Scan
+from sglpr_jax.data.scan import Scan, are_measured
 from sglpr_jax.data.scan_stream import sampled_points
 from sglpr_jax.fields import check_value
 
@@ -55,7 +55,7 @@ def chosen_scale(recording: Recording) -> Scale:
     for points in sampled_points(recording, SCANS):
         if points is None:
             continue
-        measured = points[np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)]  # 0: a ray without an echo
+        measured = points[are_measured(points)]
         if len(measured):
             ranges_m.append(np.quantile(np.hypot(*measured[:, :2].T), 0.9))
     return NEAR_SCALE if ranges_m and np.median(ranges_m) < FAR_M else 1

@@ -61,6 +61,11 @@ def check_cloud(points: Float32[np.ndarray, "n _"], *, name: str = "") -> None:
         )
 
 
+def are_measured(points: Float32[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Whether each point is finite and not (0, 0, 0), which drivers write for a ray without an echo."""
+    return np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)
+
+
 class TimeField(NamedTuple):
     """Times of the points of a scan, as a file or message states them."""
 
@@ -134,9 +139,8 @@ class Scan:
         """Time of each point relative to `time`, in seconds (`TimeField.seconds`), or None without times of points."""
         if self.time_field is None or self.points is None:
             return None
-        valid = np.isfinite(self.points).all(axis=1) & (self.points != 0).any(axis=1)
         with naming(self.name):
-            return self.time_field.seconds(valid=valid, scan_time=self.time)
+            return self.time_field.seconds(valid=are_measured(self.points), scan_time=self.time)
 
     def only(self, rows: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "Scan":
         """Return the scan with only some points (rows or a mask), their labels and lasers, without times of points."""

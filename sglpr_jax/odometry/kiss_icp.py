@@ -17,7 +17,7 @@ from sglpr_jax.data.deskew import point_times_problem, poses_at, valid_point_tim
 from sglpr_jax.data.fingerprint import fingerprint
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scaled, scaled_poses
-from sglpr_jax.data.scan import Scan
+from sglpr_jax.data.scan import Scan, are_measured
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable, scan_stream
 from sglpr_jax.data.times import usual_step
 from sglpr_jax.extras import optional_module
@@ -141,7 +141,7 @@ def _cloud(scan: Scan, is_timed: bool) -> Cloud:
     """Points of a scan that are finite and not all zero, with their times if `is_timed`."""
     points = scan.points
     assert points is not None
-    valid = np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)
+    valid = are_measured(points)
     times = valid_point_times(scan) if is_timed else None
     return points[valid].astype(np.float64), np.zeros(0) if times is None else times[valid].astype(np.float64)
 
@@ -155,7 +155,7 @@ class _FrontEnd:
         mapping = {"voxel_size": config.used_voxel_m}
         settings = importlib.import_module("kiss_icp.config").KISSConfig(data=data, mapping=mapping)
         self._icp, self._voxel_m = check_installed().KissICP(settings), config.used_voxel_m
-        self._steps, self._last_step = steps, float(steps.max(initial=1.0))
+        self._steps, self._last_step = steps, 1.0
         self._previous_clouds: deque[Float[np.ndarray, "n 3"]] = deque(maxlen=PREVIOUS)
         """Points of the previous scans in the frame of the first scan."""
 
